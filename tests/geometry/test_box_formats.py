@@ -113,9 +113,3 @@ def test_a_pitched_sensor_gives_a_pitched_car_and_each_box_may_have_its_motion()
     T_cam_obj, hwl = boxes_to_poses(boxes, "mmdet3d_lidar", motions)
     torch.testing.assert_close(T_cam_obj[1], pitch @ T_cam_obj[0])
     torch.testing.assert_close(poses_to_boxes(T_cam_obj, hwl, "mmdet3d_lidar", motions), boxes)
-
-
-def test_no_boxes() -> None:
-    T_cam_obj, hwl = boxes_to_poses(torch.zeros(0, 7), "opencv")
-    assert poses_to_boxes(T_cam_obj, hwl, "opencv").shape == (0, 7)
-    assert boxes_to_poses(torch.zeros(0, 8, 3), "kitti")[1].shape == (0, 3)

@@ -105,13 +105,6 @@ def test_there_and_back_by_kornia(regime: str, dtype: torch.dtype, atol: float) 
         torch.testing.assert_close(theirs.log(), twist, atol=1e-12, rtol=1e-12)
 
 
-def test_motions_compose_alike() -> None:
-    A, B = se3.exp(twists("uniform")), se3.exp(twists("normal"))
-    torch.testing.assert_close(se3.from_kornia(se3.to_kornia(A) * se3.to_kornia(B)), A @ B, atol=1e-13, rtol=0)
-    law = se3.to_kornia(A).adjoint() @ twists("normal")[..., None]
-    torch.testing.assert_close(A @ B @ se3.inverse(A), se3.exp(law[..., 0]), atol=1e-13, rtol=0)
-
-
 def test_gradients_flow_where_they_are_asked_for() -> None:
     T = se3.exp(twists("normal", 3))
     theirs = se3.to_kornia(T)

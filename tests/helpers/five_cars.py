@@ -9,14 +9,10 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.refinement.problem import CarStage
-from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
-from directshape_torch.terms.cars import CarState
 from helpers.ellipsoids import ellipsoid_prior
-from helpers.problems import DEFAULT
-from helpers.synthetic_scene import CAMERA_HEIGHT_M, disturbed, joined_detections, joined_frames, select, street
+from helpers.synthetic_scene import CAMERA_HEIGHT_M, disturbed, joined_detections, joined_frames, street
 
 
 @lru_cache(maxsize=1)
@@ -31,20 +27,6 @@ def five_cars() -> tuple[PCAShapePrior, FrameBatch, Detections]:
     frames = joined_frames([first.frames, second.frames])
     detections = joined_detections([first.detections, second.detections], (84, 112))
     return prior, frames, disturbed(detections)
-
-
-def begun_stage(
-    config: RefinerConfig = DEFAULT,
-    stage: int = 1,
-    cars: list[int] | None = None,
-    term_weights: dict[str, Tensor] | None = None,
-) -> tuple[CarStage, CarState]:
-    """A stage of the problem of some of the cars, and the state where it began."""
-    prior, frames, detections = five_cars()
-    if cars is not None:
-        detections = select(detections, torch.tensor(cars, dtype=torch.long))
-    problem, state = DirectShapeRefiner(prior, config).problem(frames, detections, term_weights)
-    return problem.begin(problem.stages()[stage], problem.look(state)), state
 
 
 def with_solver(config: RefinerConfig, **changes: object) -> RefinerConfig:

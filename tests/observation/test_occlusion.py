@@ -143,22 +143,15 @@ def test_what_stands_in_front_has_no_gradient() -> None:
     assert hidden.at(torch.tensor(0), torch.tensor([3, 3])).item()
 
 
-def test_random_scenes_equal_a_loop() -> None:
+def test_random_scenes_equal_the_reference_in_any_order() -> None:
     generator = torch.Generator().manual_seed(0)
     count = 7
     masks = (torch.rand(count, HEIGHT, WIDTH, generator=generator) > 0.7).float()
     depth = [12.0, torch.nan, 9.0, 30.0, 8.0, 15.0, -1.0]
     frame = [0, 0, 1, 0, 1, 0, 0]
     detections = scene(depth, [100.0, 90.0, 95.0, 80.0, 99.0, 97.0, 85.0], masks, frame)
-    in_front = instances_in_front(detections, "left")
     object_index, uv = all_pixels(count)
     hidden = hidden_pixels(detections, "left", object_index, uv).reshape(count, HEIGHT, WIDTH)
-    for j in range(count):
-        expected = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
-        for i in range(count):
-            if in_front[i, j]:
-                expected |= masks[i] > 0.5
-        assert torch.equal(hidden[j], expected)
     permutation = torch.tensor([3, 0, 6, 2, 5, 1, 4])
     permuted = scene(
         [depth[i] for i in permutation],

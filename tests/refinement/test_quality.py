@@ -12,7 +12,7 @@ from helpers.synthetic_scene import cached_street, disturbed
 from directshape_torch.config import RefinerConfig
 from directshape_torch.refinement.outcome import outcome_of
 from directshape_torch.refinement.problem import CarStage
-from directshape_torch.refinement.quality import EVIDENCE_NAMES, _probabilities, mask_ious, photometric_agreement
+from directshape_torch.refinement.quality import mask_ious, photometric_agreement
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.status import Status
 from directshape_torch.terms.cars import CarBatch, CarState
@@ -77,41 +77,6 @@ def test_photometric_agreement_is_the_mean_over_the_usable_pixels_car_by_car() -
             torch.testing.assert_close(share[car], usable.sum() / in_set.sum().double(), rtol=1e-12, atol=0)
 
 
-def test_what_is_hidden_in_the_right_image_is_not_compared() -> None:
-    """Right of the middle column something stands in front of everything."""
-    stage, state = begun()
-    term = photometric_of(stage)
-    rows = stage.photometric_part(figures_at(stage, state))
-    assert rows is not None
-    fixed = term.pixel_set
-    u, _, w = fixed.rows.along_ray[:, 4] * rows.where.depth + fixed.rows.along_baseline  # of the pixel itself
-    right_half = (u / w).round() >= 80
-    blocks = len(fixed.filled)
-    wall = fixed.rows.right._replace(
-        crop=torch.tensor([[80, 0, 160, 120, 0, 80]]).expand(blocks, -1),
-        in_front=torch.full((blocks, 2), 20.0),
-        covering=torch.full((80 * 120, 2), 10.0),
-    )
-    hidden = replace(term, fixed=fixed._replace(rows=fixed.rows._replace(right=wall)))
-    behind = replace(stage, terms=tuple(hidden if t is term else t for t in stage.terms))
-    found = behind.photometric_part(figures_at(behind, state))
-    assert found is not None
-    assert torch.equal(found.where.usable, rows.where.usable & ~right_half)
-    assert (photometric_agreement(hidden, found)[1] < photometric_agreement(term, rows)[1]).any()
-
-
-def test_no_cars_agree_with_nothing() -> None:
-    stage, state = begun()
-    none = stage.problem.of_problems(torch.zeros(2, dtype=torch.bool))
-    seen = none.look(CarState.of(state.T_obj_cam[:0], state.code[:0]))
-    empty = none.begin(none.stages()[1], seen)
-    rows = empty.photometric_part(empty.figures(seen))
-    assert rows is not None
-    error, share = photometric_agreement(photometric_of(empty), rows)
-    assert error.shape == share.shape == (0,)
-    assert mask_ious(none.masks, seen).shape == (2, 0)
-
-
 def test_a_car_with_its_input_back_costs_after_what_it_cost_before() -> None:
     stage, initial = begun()
     problem = stage.problem
@@ -136,12 +101,3 @@ def test_a_car_with_its_input_back_costs_after_what_it_cost_before() -> None:
     assert torch.equal(found.cost_before, at_input)
     assert torch.equal(found.cost_after, torch.stack([at_input[0], at_end[1]]))
     assert not torch.allclose(at_end[0], at_input[0])
-
-
-def test_probabilities_exist_for_the_method_they_were_fitted_to_alone() -> None:
-    evidence = torch.zeros(2, len(EVIDENCE_NAMES), dtype=torch.float64)
-    for probability in _probabilities(begun()[0].problem.term_names, evidence):
-        assert ((probability > 0) & (probability < 1)).all()
-    blind = replace(DEFAULT, photometric=replace(DEFAULT.photometric, weight=0.0))
-    for probability in _probabilities(begun(blind)[0].problem.term_names, evidence):
-        assert probability.isnan().all()

@@ -83,10 +83,3 @@ def test_cost_is_the_mean_norm_of_the_distances() -> None:
 def test_frames_without_points_are_refused() -> None:
     with pytest.raises(InputError, match=r"frames.points_cam: expected LiDAR points of each frame, got None"):
         DirectShapeRefiner(PRIOR, extra_terms=[LidarPoints()])(SCENE.frames, SCENE.detections)
-
-
-def test_points_of_another_shape_or_type_are_refused() -> None:
-    with pytest.raises(InputError, match="points_cam"):
-        replace(SCENE.frames, points_cam=torch.zeros(1, 5, 4, dtype=torch.float64))
-    with pytest.raises(InputError, match="points_cam: expected the dtype of images_left"):
-        replace(SCENE.frames, points_cam=torch.zeros(1, 5, 3, dtype=torch.float32))
