@@ -126,8 +126,8 @@ class DirectShapeRefiner(nn.Module):
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None
     ) -> RefinementResult:
         frames, detections = self._with_rig(frames, detections)
-        of_prior = dict((*self.prior.named_buffers(), *self.prior.named_parameters()))
-        check_no_tangents(frames, detections, term_weights, of_prior)
+        of_prior = (tensor for _, tensor in (*self.prior.named_buffers(), *self.prior.named_parameters()))
+        check_no_tangents(frames, detections, (*(term_weights or {}).values(), *of_prior))
         self._warn_of(frames, detections)
         self._warn_without_gradient(frames, detections)
         differentiate = self.config.backward.mode != "none" and torch.is_grad_enabled()

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable
 from copy import copy
-from dataclasses import fields, is_dataclass
 
 import torch
 from torch import Tensor
@@ -26,33 +25,24 @@ _MIN_DEPTH_M = 1.0
 _DTYPES = (torch.float32, torch.float64)
 
 
-def check_no_tangents(*records: object) -> None:
-    """Raise `InputError` where a tensor of mappings and dataclasses is a dual number of forward-mode differentiation.
+def check_no_tangents(frames: FrameBatch, detections: Detections, others: Iterable[Tensor]) -> None:
+    """Raise `InputError` where some tensor of a call is a dual number of forward-mode differentiation.
 
     What the iterations hold constant, they hold back from gradients; tangents would pass through it and come out wrong.
     """
     # Of the whole process, other threads' regions too: what counts is whether these tensors take part.
-    if is_forward_mode() and any(map(_has_tangent, _tensors(records))):
+    if not is_forward_mode():
+        return
+    declared = [each.value for record in (frames, detections) for each in record.tensors("")]
+    field = frames.camera.disparity_field
+    of_field = [] if field is None else [x for x in vars(field).values() if isinstance(x, Tensor)]
+    if any(unpack_dual(x).tangent is not None for x in (*declared, *of_field, *others)):  # type: ignore[no-untyped-call]
         raise InputError(
             "refiner",
             "tensors without tangents of forward-mode differentiation (torch.func.jvp, jacfwd)",
             "some with",
             "differentiate in reverse mode: .backward(), torch.func.vjp or jacrev, with backward.mode",
         )
-
-
-def _has_tangent(tensor: Tensor) -> bool:
-    return unpack_dual(tensor).tangent is not None  # type: ignore[no-untyped-call]
-
-
-def _tensors(records: Iterable[object]) -> Iterator[Tensor]:
-    for record in records:
-        if isinstance(record, Tensor):
-            yield record
-        elif isinstance(record, Mapping):
-            yield from _tensors(record.values())
-        elif is_dataclass(record):
-            yield from _tensors(getattr(record, field.name) for field in fields(record))
 
 
 def check_fit(frames: FrameBatch, detections: Detections, prior: ShapePrior) -> None:
