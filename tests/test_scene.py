@@ -130,6 +130,10 @@ def test_wrong_frames_are_named(changes: dict[str, Any], text: str) -> None:
         ("frame_index", [0, 0], "expected a tensor of shape (B,), got list; make one with torch.as_tensor"),
         ("T_cam_obj", np.zeros((2, 4, 4)), "expected a tensor of shape (2, 4, 4), got ndarray; make one with"),
         ("score", None, "expected a tensor of shape (2,), got NoneType"),
+        ("dimensions_hwl", torch.zeros(3, 3), "expected shape"),
+        ("box_2d", torch.zeros(2, 5), "expected shape"),
+        ("mask_right", torch.zeros(2, 50, 160), "expected shape"),
+        ("has_mask_left", torch.zeros(3, dtype=torch.bool), "expected shape"),
         (
             "mask_left",
             torch.zeros(2, 120, 160, dtype=torch.uint8),
