@@ -15,6 +15,7 @@ from demo_scene.camera import T_CAM_REF, CameraPose, projection
 from demo_scene.labels import CarLabel, label_line, result_line
 from demo_scene.layout import SceneLayout
 from demo_scene.surfaces import Indices, Picture
+from directshape_torch.files.atomic_files import write_text
 
 _COCO_CAR = 3
 
@@ -36,10 +37,10 @@ def write_frame(root: Path, name: str, frame: Frame) -> None:
     """Write images, calibration, labels, plane, masks, detections and the scene's description under `root`."""
     _write_views(root, ("image_2", "image_3"), name, frame, {})
     training = root / "training"
-    _write_text(training / "calib" / f"{name}.txt", calibration_text())
-    _write_text(training / "label_2" / f"{name}.txt", "".join(label_line(x) + "\n" for x in frame.labels.values()))
+    write_text(training / "calib" / f"{name}.txt", calibration_text())
+    write_text(training / "label_2" / f"{name}.txt", "".join(label_line(x) + "\n" for x in frame.labels.values()))
     detections = root / "detections" / "noisy_stereo" / "data" / f"{name}.txt"
-    _write_text(detections, "".join(result_line(x, 0.9) + "\n" for x in frame.detections.values()))
+    write_text(detections, "".join(result_line(x, 0.9) + "\n" for x in frame.detections.values()))
 
 
 def write_sequence(root: Path, name: str, frames: Sequence[Frame], interval_s: float) -> None:
@@ -53,13 +54,13 @@ def write_sequence(root: Path, name: str, frames: Sequence[Frame], interval_s: f
         when = {"time_s": number * interval_s}
         _write_views(root, ("image_02", "image_03"), f"{name}/{number:06d}", frame, when)
     lines = [(f"{n} {k}", frame.labels[k], frame.detections[k]) for n, frame in enumerate(frames) for k in frame.labels]
-    _write_text(training / "calib" / f"{name}.txt", calibration_text())
-    _write_text(training / "poses" / f"{name}.txt", "".join(pose_lines([f.layout.camera for f in frames])))
+    write_text(training / "calib" / f"{name}.txt", calibration_text())
+    write_text(training / "poses" / f"{name}.txt", "".join(pose_lines([f.layout.camera for f in frames])))
     times = "".join(f"{number * interval_s:.3f}\n" for number in range(len(frames)))
-    _write_text(training / "times" / f"{name}.txt", times)
-    _write_text(training / "label_02" / f"{name}.txt", "".join(f"{n} {label_line(x)}\n" for n, x, _ in lines))
+    write_text(training / "times" / f"{name}.txt", times)
+    write_text(training / "label_02" / f"{name}.txt", "".join(f"{n} {label_line(x)}\n" for n, x, _ in lines))
     found = "".join(f"{n} {result_line(x, 0.9)}\n" for n, _, x in lines)
-    _write_text(root / "detections" / "noisy_stereo" / f"{name}.txt", found)
+    write_text(root / "detections" / "noisy_stereo" / f"{name}.txt", found)
 
 
 def _write_views(root: Path, folders: tuple[str, str], stem: str, frame: Frame, when: dict[str, Any]) -> None:
@@ -67,11 +68,11 @@ def _write_views(root: Path, folders: tuple[str, str], stem: str, frame: Frame, 
     training = root / "training"
     for folder, image in zip(folders, (frame.image_left, frame.image_right), strict=True):
         _write_png(training / folder / f"{stem}.png", image)
-    _write_text(training / "planes" / f"{stem}.txt", plane_text(frame.layout.camera))
+    write_text(training / "planes" / f"{stem}.txt", plane_text(frame.layout.camera))
     masks = mask_entries(frame.instance_left, "left") + mask_entries(frame.instance_right, "right")
-    _write_text(training / "masks" / f"{stem}.json", json.dumps(masks))
+    write_text(training / "masks" / f"{stem}.json", json.dumps(masks))
     description = json.dumps({**when, **scene_description(frame.layout)}, indent=1)
-    _write_text(training / "meta" / f"{stem}.json", description + "\n")
+    write_text(training / "meta" / f"{stem}.json", description + "\n")
 
 
 def pose_lines(cameras: Sequence[CameraPose]) -> list[str]:
@@ -148,8 +149,3 @@ def _write_png(path: Path, picture: Picture) -> None:
     if not encoded:
         raise OSError(f"{path}: OpenCV could not encode the picture")
     path.write_bytes(data.tobytes())
-
-
-def _write_text(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
