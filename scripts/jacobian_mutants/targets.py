@@ -236,6 +236,7 @@ _IN_PAIRS = "enters as a square, or twice as a factor"
 
 EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("exp", "torch.bmm(X2, X)", "(torch.bmm(X, X2))", "powers of one matrix commute"),
+    Equivalent("GridShape.value_and_derivatives", "nothing_is_differentiated()", None, "only its truth is asked for"),
     Equivalent("GridField.at_corners", "k * z", "(k)", "the stride of the last axis is one"),
     *(
         Equivalent(
