@@ -324,6 +324,7 @@ def test_a_track_that_a_compiler_traces_ends_where_a_plain_one_does(monkeypatch:
     )
     assert graphs() >= 4
     assert "path" in traced.term_names
-    assert traced.track_part.tolist() == [0] * 3
+    # The third view, whose box was nearly right, costs more than its input with the shape of all.
+    assert traced.track_part.tolist() == plain.track_part.tolist() == [0, 0, -1]
     torch.testing.assert_close(traced.T_cam_obj, plain.T_cam_obj, rtol=0, atol=0.02)
     torch.testing.assert_close(traced.code, plain.code, rtol=0, atol=0.1)
