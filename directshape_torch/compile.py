@@ -27,9 +27,8 @@ from directshape_torch.numerics.gradient_mode import is_plain, nothing_is_differ
 
 CompileMode = Literal["auto", "on", "off"]
 
-# A cold start takes as long as compiled code saves with so many cars, in frames by themselves: `first_s` of
-#     PYTHONPATH=scripts python -m benchmark_suites.compile_cost --threads 1 --mode compiled|eager
-# in the two modes differ by the former with an empty TORCHINDUCTOR_CACHE_DIR, `again_s` by the latter.
+# Between what a start takes with compiled forms on the disk (10 s) and without (a minute), counted in what they save
+# of a car of a frame by itself (6 to 10 ms, docs/performance.md): 1000 cars and 6000 to 10 000.
 CARS_WORTH_COMPILING = 3000
 
 # Nothing in place: PyTorch 2.13 lets an operation write over a part of a `torch.stack` too, and then gives the whole
