@@ -118,7 +118,8 @@ class _MovingCar:
         _add(scene, _CAR, mesh, paint, _CAMERA)
         numbers = image_numbers([frame_id.removeprefix(f"{sequence}_") for frame_id in self.T_cam_obj])
         seconds, T_views = np.array(self.time_s), np.stack(list(self.T_cam_obj.values()))
-        if np.isnan(seconds).any():
+        # Not of times that are unknown, nor of those that do not go on, which no glTF animation may have.
+        if not (np.diff(seconds) > 0).all():
             seconds = _SECONDS_A_FRAME * np.array(list(numbers.values()))
         return _glb(scene, lambda buffers, tree: _animate(buffers, tree, seconds - seconds[0], T_views))
 
