@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
@@ -21,11 +21,14 @@ from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rows import Blocks
 from directshape_torch.scene import Detections
+from directshape_torch.shape.field import Field
 from directshape_torch.status import Status
 from directshape_torch.terms.car_points import car_points
 from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.point_cloud import PointCloud
 from directshape_torch.terms.priors import PriorResidual, PriorTerm, height_prior
+from directshape_torch.terms.robust import RobustValue, quadratic
+from directshape_torch.terms.term import Linear, Term, Where
 
 
 def lower_by(metres: Tensor | float) -> Callable[[CarBatch, CarState], PriorResidual]:
@@ -204,8 +207,63 @@ def test_a_member_that_is_missing_is_named() -> None:
     class Bare:
         names = ("user",)
 
-    with pytest.raises(InputError, match=r"extra term Bare: expected the members of `Term`, got none called is_prior"):
+    with pytest.raises(InputError, match=r"extra term Bare: expected the members of `Term`, got none called blocks"):
         refine(lambda *_: Bare())  # type: ignore[arg-type, return-value]
+
+
+REQUIRED = ("names", "blocks", "block_weight", "information", "row_weight", "linear", "residual", "norm", "of_cars")
+
+
+@pytest.mark.parametrize("name", REQUIRED)
+def test_what_a_subclass_leaves_out_is_named_unless_it_has_a_default(name: str) -> None:
+    members = {member: getattr(PriorTerm, member) for member in REQUIRED if member != name}
+    kind = type("Short", (Term,), members)
+    with pytest.raises(InputError, match=f"extra term Short: expected the members of `Term`, got none called {name}"):
+        refine(lambda *_: kind())
+
+
+@dataclass(frozen=True)
+class LowerTerm(Term):
+    """Heights as above, of numbers that are fields."""
+
+    names: tuple[str, ...]
+    cars: CarBatch
+    blocks: Blocks
+    block_weight: Tensor
+    column: Tensor
+    row_weight: Tensor
+
+    @property
+    def information(self) -> Tensor:
+        return self.block_weight
+
+    @classmethod
+    def of(cls, name: str, cars: CarBatch) -> LowerTerm:
+        weight = torch.full((len(cars),), 1e5, dtype=torch.float64)
+        blocks = Blocks.one_each(len(cars), weight.device)
+        return cls((name,), cars, blocks, weight, torch.zeros_like(blocks.owner), torch.ones(len(cars), 1, 1).double())
+
+    def linear(self, field: Field, state: CarState, where: Where) -> Linear:
+        at, one = lower_by(0.1)(self.cars, state), torch.ones_like(self.row_weight)
+        return Linear(at.residual[..., None], one, at.J_residual_state, where)
+
+    def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
+        return lower_by(0.1)(self.cars, state).residual[..., None]
+
+    def norm(self, residual: Tensor) -> RobustValue:
+        return quadratic(residual)
+
+    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> LowerTerm:
+        return LowerTerm.of(self.names[0], self.cars.of_cars(keep, numbers))
+
+
+def test_members_may_be_fields_of_a_dataclass() -> None:
+    with pytest.raises(TypeError, match="6 required positional arguments"):
+        LowerTerm()  # type: ignore[call-arg]
+    by_fields = refine(lambda *scene: LowerTerm.of("user", scene[2]))
+    by_properties = refine(lambda *scene: PriorTerm("user", 1e5, scene[2], lower_by(0.1), 1, is_prior=False))
+    torch.testing.assert_close(by_fields.T_cam_obj, by_properties.T_cam_obj, rtol=0, atol=0)
+    torch.testing.assert_close(by_fields.covariance, by_properties.covariance, rtol=0, atol=0)
 
 
 def test_two_terms_of_one_name_are_named() -> None:

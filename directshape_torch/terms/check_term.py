@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Collection
 
 import torch
@@ -13,10 +14,8 @@ from directshape_torch.numerics.checks import check_shape
 from directshape_torch.rows import Blocks
 from directshape_torch.terms.term import Linear, Sight, Term, Where, linear_of
 
-_MEMBERS = (
-    *("names", "is_prior", "blocks", "column", "block_weight", "information", "row_weight"),
-    *("begin", "moving", "where", "linear", "residual", "norm", "of_cars"),
-)
+_OWN = ("names", "blocks", "block_weight", "information", "row_weight", "linear", "residual", "norm", "of_cars")
+_DEFAULTS = ("is_prior", "column", "begin", "moving", "where")
 
 
 @torch.no_grad()
@@ -29,8 +28,7 @@ def check_term(term: Term, stage: StageConfig, sight: Sight, taken: Collection[s
         sight: what rays see at any state of these cars.
         taken: names of other terms.
     """
-    # Not `hasattr`: rows may be known only when a stage has begun.
-    missing = [name for name in _MEMBERS if name not in dir(term)]
+    missing = [name for name in (*_OWN, *_DEFAULTS) if not _has(term, name)]
     if missing:
         raise InputError(f"extra term {type(term).__name__}", "the members of `Term`", f"none called {missing[0]}")
     names = term.names
@@ -51,6 +49,13 @@ def check_term(term: Term, stage: StageConfig, sight: Sight, taken: Collection[s
         keep = torch.arange(num_cars, device=sight.state.code.device) > 0
         part = moving.of_cars(keep, range(1, num_cars))
         _check_rows(f"{called} after of_cars(...)", part, num_cars - 1)
+
+
+def _has(term: Term, name: str) -> bool:
+    """Whether it has a member, and not only the empty one that a subclass of `Term` inherits."""
+    # Not `hasattr`: rows may be known only when a stage has begun.
+    is_inherited = name in _OWN and inspect.getattr_static(term, name, None) is vars(Term)[name]
+    return name in dir(term) and not is_inherited
 
 
 def _check_rows(called: str, term: Term, num_cars: int) -> None:

@@ -7,8 +7,9 @@ factors, and its Jacobian is never kept: `J_residual_state = J_residual_inner J_
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol, Self, TypeAlias
+from typing import Any, NamedTuple, NoReturn, Protocol, Self, TypeAlias
 
 import torch
 from torch import Tensor
@@ -44,12 +45,25 @@ class Linear(NamedTuple):
     where: Where  # the points at which they were taken
 
 
+class _FieldAlone:
+    """A name without a value on the class: that of each object counts."""
+
+    def __get__(self, term: object, kind: type) -> NoReturn:
+        raise AttributeError(f"{kind.__name__} object has no value of this field")
+
+
 class Term(Protocol):
     """One summand of the energy, for B cars. Terms never change: a new stage makes a new term.
 
     A subclass need not write what is here: a measurement of one column, whose rows are the same in all stages, may all
-    change, and look nowhere.
+    change, and look nowhere. Fields of a dataclass may stand for properties.
     """
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        # A dataclass takes what it inherits under the name of a field for its default, and could not set a property.
+        for name in inspect.get_annotations(cls).keys() & vars(Term).keys() - vars(cls).keys():
+            setattr(cls, name, _FieldAlone())
 
     @property
     def names(self) -> tuple[str, ...]:
