@@ -160,12 +160,13 @@ def load_trust_model(path: Path | str) -> TrustModel:
     content = read_json(path, cure)
     try:
         if content["schema"] != SCHEMA:
-            raise DataFormatError(path, f"has schema {content['schema']!r}, this version reads {SCHEMA!r}")
+            raise ValueError(f"schema {content['schema']!r}, this version reads {SCHEMA!r}")
         better, not_worse = (_head(content[name]) for name in ("better", "not_worse"))
         factors, floors = (tuple(map(float, content[name])) for name in ("sigma_factors", "sigma_floors"))
-        unknown = {*better.columns, *not_worse.columns} - set(EVIDENCE_NAMES)
-        if unknown or len(factors) != 4 or len(floors) != 4:
-            raise DataFormatError(path, f"has unknown columns {sorted(unknown)}, or not four sigmas")
+        if unknown := {*better.columns, *not_worse.columns} - set(EVIDENCE_NAMES):
+            raise ValueError(f"unknown columns {sorted(unknown)}")
+        if len(factors) != 4 or len(floors) != 4:
+            raise ValueError(f"{len(factors)} factors and {len(floors)} floors of sigmas, not 4")
         return TrustModel(better, not_worse, factors, floors, content["provenance"])
     except (ValueError, KeyError, TypeError) as error:
         raise DataFormatError(path, f"is no model of trust ({error})", cure=cure) from error

@@ -11,12 +11,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from directshape_torch.errors import DataFormatError
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
 from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
 from directshape_torch.files.read_files import read_npz
 from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
+from directshape_torch.refinement.quality import EVIDENCE_NAMES
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.estimate import RigEstimate
@@ -70,8 +72,16 @@ class Observations:
 
     @classmethod
     def load(cls, path: Path) -> Observations:
-        """Those of `save`."""
+        """Those of `save`.
+
+        Raises:
+            DataFormatError: their evidence has the columns of another version.
+        """
         arrays = read_npz(path)
+        known, wanted = arrays["evidence"].shape[1:], (len(EVIDENCE_NAMES),)
+        if known != wanted:
+            cure = "delete it, and its cars are refined again"
+            raise DataFormatError(path, f"has evidence {known} of each car, this version's is {wanted}", cure=cure)
         return cls(**{f.name: arrays[f.name] for f in fields(cls)})
 
 

@@ -68,9 +68,12 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
     MODEL.save(path)
     content = json.loads(path.read_text())
     for change, words in (
-        ({"schema": "other/1"}, "has schema 'other/1'"),
-        ({"sigma_floors": [0.1]}, "not four sigmas"),
-        ({"better": {**content["better"], "columns": ["log_sigma_yaw", "colour"]}}, "unknown columns .'colour'."),
+        ({"schema": "other/1"}, r"json: is no model of trust \(schema 'other/1', this version reads"),
+        ({"sigma_floors": [0.1]}, r"\(4 factors and 1 floors of sigmas, not 4\)"),
+        (
+            {"better": {**content["better"], "columns": ["log_sigma_yaw", "colour"]}},
+            r"trust \(unknown columns .'colour'.\); write it with",
+        ),
         ({"better": {**content["better"], "weights": [1.0]}}, "2 columns need as many"),
     ):
         path.write_text(json.dumps(content | change))

@@ -14,6 +14,7 @@ from quality_calibration import fit, noise, observations, report
 from quality_calibration.bend import Bend
 
 from directshape_torch.cli.demo import demo_dataset
+from directshape_torch.errors import DataFormatError
 from directshape_torch.geometry.box3d import rotation_y_from_pose
 from directshape_torch.geometry.disparity_field import polynomial_basis
 from directshape_torch.refinement.quality import EVIDENCE_NAMES, load_trust_model
@@ -74,6 +75,13 @@ def test_no_prediction_has_seen_its_frame() -> None:
 
     predictions = fit.cross_validated(cars, seen)
     assert np.unique(predictions).tolist() == [220.0]
+
+
+def test_kept_cars_of_another_version_are_refused(tmp_path: Path) -> None:
+    cars = simulated(12)
+    replace(cars, evidence=np.pad(cars.evidence, ((0, 0), (0, 22)))).save(tmp_path / "cars.npz")
+    with pytest.raises(DataFormatError, match=r"has evidence \(30,\) of each car, this version's is \(8,\); delete it"):
+        observations.Observations.load(tmp_path / "cars.npz")
 
 
 def judged(cars: observations.Observations, probabilities: np.ndarray) -> report.Judged:
