@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import math
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -13,7 +15,10 @@ from helpers.synthetic_scene import cached_street
 from torch import Tensor
 
 from directshape_torch import DirectShapeRefiner, RigEstimate
-from directshape_torch.geometry.disparity_field import polynomial_basis
+from directshape_torch.cli.demo import DEMO_FOLDER
+from directshape_torch.geometry.disparity_field import EXPONENTS, polynomial_basis
+from directshape_torch.io.stereo_dataset import open_dataset
+from directshape_torch.rig.from_files import estimate_rigs
 from directshape_torch.rig.pixels import pixel_evidence
 from directshape_torch.rig.rig_file import load_fields, load_rigs, save_field, save_rigs
 
@@ -38,6 +43,21 @@ def test_errors_are_as_large_as_the_estimate_says() -> None:
     assert float((z.abs() < 2).double().mean()) > 0.9
     assert 0.4 < float(torch.tensor(biases).square().mean().sqrt()) < 1.3
     assert float(torch.tensor(noises).mean()) == pytest.approx(0.03, abs=0.008)
+
+
+def test_where_nothing_is_known_rectification_leaves_some_tenths_of_a_pixel() -> None:
+    """Degree by degree, over four rigs from one that is off by as much to one that is exact; the setback, metres."""
+    some_rigs = math.sqrt((1 + 0.5**2 + 0.25**2 + 0.05**2) / 4)
+    sigma = estimate().covariance.diagonal().sqrt()
+    by_degree = torch.tensor([(0.4, 0.4, 0.5, 0.3, 0.5)[i + j] for i, j in EXPONENTS], dtype=torch.float64)
+    torch.testing.assert_close(sigma[:-2], some_rigs * by_degree)
+    assert float(sigma[-1]) == pytest.approx(0.15)
+
+
+def test_a_single_car_moves_the_rows_of_the_middle() -> None:
+    """By its own 0.02 px less what a prior of 0.4 px says against 0.1 px of noise."""
+    middle = torch.tensor([[0.5 * SIZE_WH[0], 0.5 * SIZE_WH[1], 20.0, 0.0, 0.05, 0.02, 0.0, 0.0]], dtype=torch.float64)
+    assert float(estimate(middle).field.vertical(middle[:, :2])) == pytest.approx(0.02 * 0.95, rel=0.02)
 
 
 def test_a_biased_detector_leaves_the_field_unharmed() -> None:
@@ -117,3 +137,18 @@ def test_the_detectors_depth_error_becomes_its_prior_where_nobody_says_another()
     own = replace(scene.detections, pose_sigma=torch.ones_like(informed.pose_sigma))
     assert rig.informed(scene.frames, own) is own
     assert few.informed(scene.frames, scene.detections) is scene.detections
+
+
+def test_frames_are_taken_evenly_from_all_of_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that an estimate that soon knows enough has seen more than the beginning of a drive."""
+    for path in (path for path in DEMO_FOLDER.rglob("000000.*") if path.is_file()):
+        folder = tmp_path / path.relative_to(DEMO_FOLDER).parent
+        folder.mkdir(parents=True)
+        for number in range(8):
+            shutil.copy(path, folder / f"{number:06d}{path.suffix}")
+    monkeypatch.setattr(RigEstimate, "update", lambda *_: None)
+    dataset = open_dataset("kitti", tmp_path, tmp_path / "detections/noisy_stereo", frames=[3])
+    seen: list[str] = []
+    (rig,) = estimate_rigs(dataset, seen.append)
+    assert [int(name) for name in seen] == [0, 4, 2, 6, 1, 5, 3, 7]
+    assert not len(rig.rows)
