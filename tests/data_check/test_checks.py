@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from directshape_torch.io.kitti_calibration import KittiCalibration
 from directshape_torch.io.stereo_dataset import LayoutName, open_dataset
 from directshape_torch.scene_check.check_images import PairMatches, check_calibration, check_pair
 from directshape_torch.scene_check.check_places import check_distances
-from directshape_torch.scene_check.finding import CheckReport, Finding
+from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, unreadable
 
 SIZE_HW = (400, 1200)
 K = np.array([[700.0, 0, 600], [0, 700, 200], [0, 0, 1]])
@@ -69,6 +70,21 @@ def matches(
 def test_pairs(pair: PairMatches, expected: list[tuple[str, str]]) -> None:
     found = check_pair(pair, None, SIZE_HW, "frame 1")
     assert [(finding.check, finding.severity) for finding in found] == expected
+
+
+def test_a_turned_camera_is_told_from_one_that_is_tilted() -> None:
+    (finding,) = check_pair(matches(across=3.0), None, SIZE_HW, "frame 1")
+    found = re.findall(r"([-+][0-9.]+) px more from (left|top)", finding.measured)
+    slopes = {edge: float(number) for number, edge in found}
+    assert slopes == {"left": pytest.approx(3.0, abs=0.3), "top": pytest.approx(0.0, abs=0.3)}
+
+
+def test_errors_come_first_and_files_say_their_own_cure() -> None:
+    note, error = (Finding("a", severity, "", "", "", "") for severity in ("note", "error"))
+    assert by_severity([note, error]) == (error, note)
+    for text, cure in (("a.json: is empty; write it", "write it"), ("a.json: is empty", "check it")):
+        finding = unreadable("mask_file", "frame 1", "a list", ValueError(text), "check it")
+        assert (finding.measured, finding.cure) == ("a.json: is empty", cure)
 
 
 def test_rows_may_differ_as_the_calibration_says() -> None:
