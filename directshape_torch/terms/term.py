@@ -62,8 +62,9 @@ class Term(Protocol):
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         # A dataclass takes what it inherits under the name of a field for its default, and could not set a property.
-        for name in inspect.get_annotations(cls).keys() & vars(Term).keys() - vars(cls).keys():
-            setattr(cls, name, _FieldAlone())
+        for name in inspect.get_annotations(cls).keys() & vars(Term).keys():
+            if inspect.getattr_static(cls, name) is vars(Term)[name]:
+                setattr(cls, name, _FieldAlone())
 
     @property
     def names(self) -> tuple[str, ...]:
