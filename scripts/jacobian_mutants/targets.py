@@ -246,6 +246,7 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     ),
     Equivalent("tilt_prior_normal", "zero", "(-zero)", _OF_ZERO),
     Equivalent("NextView.linear", "others", "(-others)", _OF_ZERO),
+    Equivalent("pose_prior", "R_cam_obj", "(-R_cam_obj)", f"in J_heading_omega it {_IN_PAIRS}"),
     Equivalent("_higher_exp_coefficients", "0.5 * angle", "(-(0.5 * angle))", "only the square of its sine is used"),
     Equivalent(
         "project",
