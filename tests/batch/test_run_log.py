@@ -18,6 +18,7 @@ from directshape_torch.errors import DataFormatError, RunInProgressError
 # Does not end by itself: holds the folder until it is killed.
 HOLDER = """
 import sys, time
+from pathlib import Path
 from directshape_torch.batch.run_log import RunBeginning, RunLog
 with RunLog(Path(sys.argv[1])) as log:
     log.begin(RunBeginning({}, 3))
