@@ -52,6 +52,8 @@ def test_kitti_json_says_what_the_lines_and_the_npz_say(finished: FinishedRun, e
     first = content["objects"][0]
     np.testing.assert_allclose(first["sigma_xyz_yaw"], state["sigmas_ref"][0])
     np.testing.assert_allclose(first["code"], state["codes"][0])
+    for name in ("better", "not_worse"):
+        np.testing.assert_allclose(first[f"probability_{name}"], state[f"probabilities_{name}"][0])
     np.testing.assert_allclose(first["location"], state["boxes_location_ref"][0], atol=1e-4)
 
 
