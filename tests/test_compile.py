@@ -258,6 +258,7 @@ class TestWithoutCompiler:
 NOWHERE = """
 import logging, torch
 from directshape_torch.compile import compiling
+from directshape_torch.errors import CompilationError
 logging.basicConfig()
 for mode in ("auto", "auto", "on"):
     try:

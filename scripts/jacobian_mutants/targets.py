@@ -41,7 +41,7 @@ TARGETS: dict[str, Target] = {
             "closest_approach_residual",
             "sdf_state_jacobian",
         ),
-        _JACOBIANS,
+        (*_JACOBIANS, "tests/terms/test_silhouette.py"),
     ),
     "silhouette_products": Target(
         "directshape_torch/terms/silhouette.py",
@@ -56,12 +56,12 @@ TARGETS: dict[str, Target] = {
     "photometric_rows": Target(
         "directshape_torch/terms/photometric_rows.py",
         ("compared", "warped_pixels", "patch_derivative"),
-        (*_OFFSET, *_GRADIENTS),
+        (*_OFFSET, *_GRADIENTS, "tests/terms/test_photometric_rows.py", "tests/terms/test_photometric.py"),
     ),
     "point_cloud": Target(
         "directshape_torch/terms/point_cloud.py",
         ("PointCloud.linear", "PointCloud.residual", "PointCloud._points_obj"),
-        _JACOBIANS,
+        (*_JACOBIANS, "tests/terms/test_point_cloud.py"),
     ),
     "priors": Target(
         "directshape_torch/terms/priors.py",
@@ -237,6 +237,11 @@ _IN_PAIRS = "enters as a square, or twice as a factor"
 EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("exp", "torch.bmm(X2, X)", "(torch.bmm(X, X2))", "powers of one matrix commute"),
     Equivalent("GridShape.value_and_derivatives", "nothing_is_differentiated()", None, "only its truth is asked for"),
+    Equivalent("SilhouetteProducts.linear", "nothing_is_differentiated()", None, "only its truth is asked for"),
+    Equivalent("near_surface", "where.depth", "(-where.depth)", "a hit is tracked from its point, not from its depth"),
+    Equivalent("near_surface", "-1.0", "(1.0)", "of rays without a surface, whose quotient nobody asks for"),
+    Equivalent("depth_of", "-1.0", "(1.0)", "of rays without a surface, whose quotient nobody asks for"),
+    Equivalent("_Layout.of", "terms[0]", "terms[1]", "all terms are of the same cars"),
     Equivalent("GridField.at_corners", "k * z", "(k)", "the stride of the last axis is one"),
     *(
         Equivalent(
