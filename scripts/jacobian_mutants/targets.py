@@ -51,7 +51,7 @@ TARGETS: dict[str, Target] = {
     "photometric": Target(
         "directshape_torch/terms/photometric.py",
         ("Photometric.linear", "Photometric.residual", "Photometric.warped_depth", "near_surface", "depth_of"),
-        (*_OFFSET, *_GRADIENTS),
+        (*_OFFSET, *_GRADIENTS, f"{_LABORATORY}::test_a_tracked_pixel_ends_on_the_surface"),
     ),
     "photometric_rows": Target(
         "directshape_torch/terms/photometric_rows.py",

@@ -23,6 +23,7 @@ from directshape_torch.laboratory.experiments import (
 from directshape_torch.laboratory.regimes import REGIMES
 from directshape_torch.shape.field import field_of
 from directshape_torch.terms import photometric
+from directshape_torch.terms.cars import retract
 from directshape_torch.terms.depth import Closest
 
 BenchOf = Callable[..., Bench]
@@ -100,9 +101,10 @@ def test_sums_are_those_of_single_residuals(bench_of: BenchOf, regime: str) -> N
     stage = replace(bench.stage, problem=problem)
     figures = stage.figures(bench.sight)
     column = 0
-    for term in stage.terms:
+    for number_of_term, term in enumerate(stage.terms):
         at = term.linear(bench.sight.field, bench.state, term.where(bench.sight))
         norm, J = term.norm(at.residual), jacobian(at)
+        assert torch.equal(figures.parts[number_of_term].residual, at.residual)
         for number in range(len(term.names)):
             for car in range(num_cars):
                 of_cell = (term.blocks.owner == car) & (term.column == number)
@@ -131,6 +133,23 @@ def test_sums_are_those_of_single_residuals(bench_of: BenchOf, regime: str) -> N
         torch.testing.assert_close(seen_by_solver.hessian, figures.hessian.sum(dim=1), rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(by_autograd.gradient, start.gradient, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(by_autograd.hessian, start.hessian, rtol=1e-9, atol=1e-9)
+
+
+@torch.no_grad()
+def test_a_tracked_pixel_ends_on_the_surface(bench_of: BenchOf) -> None:
+    """After a step of the car the depth is a Newton step nearer to the surface than the point it is taken from."""
+    bench = bench_of("typical")
+    term, field = bench.stage.photometric, bench.sight.field
+    assert term is not None
+    step = torch.full((len(bench.state.code), bench.num_unknowns), 0.03, dtype=torch.float64)
+    moved = retract(bench.state, step, max_code=3.0)._replace(code=bench.state.code)
+    rays = term.pixel_set.rows.rays
+    found = photometric.near_surface(rays, field, moved, term.where(bench.sight))
+    here, end = (
+        field.value(points, rays.owner)[found.found].abs() for points in (found.points_obj, found.rays.at(found.depth))
+    )
+    assert float(here.max()) > 1e-5
+    assert float(end.mean()) < 0.3 * float(here.mean())
 
 
 @pytest.mark.parametrize("factor", FACTORS)
