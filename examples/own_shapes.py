@@ -2,7 +2,7 @@
 
     python examples/own_shapes.py [--out DIR] [--meshes DIR]
 
-Without `--meshes` a dozen meshes are made by the package's own generator of cars. Forty or more real ones are better;
+Without `--meshes` a dozen are made of the bundled shapes. Forty or more real ones are better;
 `directshape build-prior` does the same from the command line and says what each mesh lacked.
 """
 
@@ -19,10 +19,9 @@ from directshape_torch import DirectShapeRefiner, PCAShapePrior, RefinementResul
 from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
-from directshape_torch.shape.parametric_cars import car_mesh
-from directshape_torch.shape.parametric_cars_types import sample_car
 from directshape_torch.shape.pca_fit import fit_pca
 from directshape_torch.shape.pca_prior import PriorProvenance
+from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 
 ROOT = Path(directshape_torch.__file__).parent / "assets" / "demo"
 
@@ -30,8 +29,10 @@ ROOT = Path(directshape_torch.__file__).parent / "assets" / "demo"
 def make_meshes(folder: Path, count: int = 12) -> None:
     """Cars in the object frame: x forward, y down, the ground at y = 0, metres."""
     folder.mkdir(parents=True, exist_ok=True)
-    for seed in range(count):
-        car_mesh(sample_car(seed), spacing_m=0.08).export(folder / f"car_{seed:03d}.ply")
+    prior = PCAShapePrior.load_bundled()
+    codes = torch.randn(count, prior.num_codes, generator=torch.Generator().manual_seed(0))
+    for number, values in enumerate(prior.values(codes)):
+        sdf_to_mesh(values, prior.origin, prior.spacing_m).export(folder / f"car_{number:03d}.ply")
 
 
 def build(meshes: Path, num_codes: int = 4) -> PCAShapePrior:

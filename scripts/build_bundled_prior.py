@@ -3,7 +3,7 @@
     python scripts/build_bundled_prior.py [--num-cars 600 --num-codes 8 --out PATH]
     python scripts/build_bundled_prior.py --kernel 32 --out kernel_prior.safetensors
 
-No mesh goes in: every car comes from `directshape_torch.shape.parametric_cars`. The ranges of its measures were
+No mesh goes in: every car comes from `parametric_cars`. The ranges of its measures were
 adjusted by hand while looking at how the prior fits real car meshes.
 A kernel PCA of the same cars is not bundled: 32 components of grids weigh 3 MB, its results are no better.
 """
@@ -17,12 +17,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from parametric_cars.measures import sample_car
+from parametric_cars.surfaces import car_sdf
 from tqdm import tqdm
 
 from directshape_torch.shape.kernel_pca_prior import KernelPCAShapePrior
 from directshape_torch.shape.mesh_to_sdf import GridSpec
-from directshape_torch.shape.parametric_cars import car_sdf
-from directshape_torch.shape.parametric_cars_types import sample_car
 from directshape_torch.shape.pca_fit import fit_pca
 from directshape_torch.shape.pca_prior import PriorProvenance
 

@@ -2,7 +2,7 @@
 
     python scripts/train_neural_prior.py [--num-cars 600 --num-codes 8 --steps 6000 --seed 0 --out PATH]
 
-No mesh goes in: every car comes from `directshape_torch.shape.parametric_cars`, the same cars as in the bundled PCA
+No mesh goes in: every car comes from `parametric_cars`, the same cars as in the bundled PCA
 prior (seeds from 0). An auto-decoder: the codes of the training cars start at their whitened principal components and
 are learned with the weights; at the end they are whitened again, and the map that does it is folded into the weights.
 One idle core: three minutes for the cars, two for the weights. Seeded: the same bytes on the same machine.
@@ -19,12 +19,12 @@ import numpy as np
 import torch
 from build_bundled_prior import GRID, sample_grid
 from numpy.typing import NDArray
+from parametric_cars.measures import sample_car
+from parametric_cars.surfaces import car_mesh, car_sdf
 from torch import Tensor
 from tqdm import tqdm
 
 from directshape_torch.shape.neural_prior import NeuralShapePrior
-from directshape_torch.shape.parametric_cars import car_mesh, car_sdf
-from directshape_torch.shape.parametric_cars_types import sample_car
 from directshape_torch.shape.pca_fit import training_codes
 from directshape_torch.shape.pca_prior import PriorProvenance
 from directshape_torch.shape.sdf_grid import zero_level_extents

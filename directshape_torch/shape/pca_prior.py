@@ -147,7 +147,7 @@ class PCAShapePrior(nn.Module):
 
     @classmethod
     def load_bundled(cls) -> PCAShapePrior:
-        """The passenger cars that come with the package (from `parametric_cars`; licence of this project)."""
+        """The passenger cars that come with the package (of parametric cars; licence of this project)."""
         return cls.load(Path(__file__).parents[1] / "assets" / "car_prior.npz")
 
     def get_extra_state(self) -> Tensor:

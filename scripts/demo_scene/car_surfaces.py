@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from parametric_cars import surfaces as cars
 
 from demo_scene.camera import Array, transform
 from demo_scene.layout import PlacedCar
 from demo_scene.surfaces import Indices, Material, Surface
-from directshape_torch.shape import parametric_cars as cars
 
 # One more part than `parametric_cars` knows: the gaps around doors, bonnet and tailgate.
 _GAP = 100

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +136,7 @@ def scene_description(layout: SceneLayout) -> dict[str, Any]:
                 "T_cam_obj": (layout.camera.T_cam_road @ car.T_road_obj).tolist(),
                 "paint_rgb": list(car.paint_rgb),
                 "metallic": car.metallic,
-                "parameters": car.parameters.as_dict(),
+                "parameters": asdict(car.parameters),
             }
             for car in layout.cars
         ],

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from parametric_cars.measures import CarParameters, sample_car
 
 from demo_scene.camera import Array, CameraPose, project, transform
-from directshape_torch.shape.parametric_cars_types import CarParameters, sample_car
 
 # Lateral measures of the street, metres in the road frame; traffic keeps to the right.
 LEFT_KERB_M, LEFT_LANE_M, CENTRE_LINE_M, RIGHT_LANE_M, RIGHT_KERB_M = -7.55, -5.3, -1.75, 1.75, 4.0

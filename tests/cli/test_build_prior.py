@@ -2,11 +2,11 @@ import json
 from pathlib import Path
 
 import pytest
+from parametric_cars.measures import sample_car
+from parametric_cars.surfaces import car_mesh
 
 from directshape_torch.cli import build_prior
 from directshape_torch.cli.main import make_parser
-from directshape_torch.shape.parametric_cars import car_mesh
-from directshape_torch.shape.parametric_cars_types import sample_car
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 

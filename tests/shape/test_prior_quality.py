@@ -4,12 +4,12 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.priors import first_components
+from parametric_cars.measures import sample_car
+from parametric_cars.surfaces import car_sdf
 
 from directshape_torch.errors import InputError
 from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.mesh_to_sdf import GridSpec, load_mesh_obj, mesh_to_sdf
-from directshape_torch.shape.parametric_cars import car_sdf
-from directshape_torch.shape.parametric_cars_types import sample_car
 from directshape_torch.shape.pca_fit import fit_pca
 from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
 from directshape_torch.shape.prior_quality import NEAR_SURFACE_M, fit_car, grid_of, leave_one_out_errors_cm

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
+from parametric_cars import surfaces as cars
+from parametric_cars.measures import BODY_TYPES, sample_car
+from parametric_cars.surfaces import polygon_distance
 
 from directshape_torch.errors import InputError
-from directshape_torch.shape import parametric_cars as cars
-from directshape_torch.shape.parametric_cars import polygon_distance
-from directshape_torch.shape.parametric_cars_types import BODY_TYPES, sample_car
 
 
 @pytest.mark.parametrize("body_type", BODY_TYPES)

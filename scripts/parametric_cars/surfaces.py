@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from directshape_torch.errors import InputError
-from directshape_torch.shape.parametric_cars_types import CarParameters
+from parametric_cars.measures import CarParameters
 
 if TYPE_CHECKING:
     import trimesh
@@ -178,12 +178,6 @@ def car_mesh(parameters: CarParameters, spacing_m: float = 0.03) -> trimesh.Trim
 
     Raises:
         InputError: spacing not within 5 mm to 0.2 m.
-
-    Examples:
-        >>> from directshape_torch.shape.parametric_cars_types import sample_car
-        >>> mesh = car_mesh(sample_car(3, "city"), spacing_m=0.08)
-        >>> bool(mesh.is_watertight), bool(mesh.volume > 3.0)
-        (True, True)
     """
     import trimesh
 
@@ -198,12 +192,6 @@ def car_sdf(parameters: CarParameters, points_obj: Array) -> Array:
 
     Distances are to the tangent plane of the nearest of densely sampled surface points when they are near, so that
     they are right to a few millimetres; the solid's implicit function is no distance where its parts are bent.
-
-    Examples:
-        >>> from directshape_torch.shape.parametric_cars_types import sample_car
-        >>> car = sample_car(3, "city")
-        >>> bool(car_sdf(car, np.array([[0.0, -0.6, 0.0]]))[0] < -0.2)
-        True
     """
     points = np.asarray(points_obj, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -253,12 +241,6 @@ def car_part_labels(car: CarParameters, points_obj: Array) -> NDArray[np.int64]:
 
     Returns:
         (N,) of `PAINT, GLASS, TYRE, RIM, LIGHT, PLATE, TRIM`.
-
-    Examples:
-        >>> from directshape_torch.shape.parametric_cars_types import sample_car
-        >>> car = sample_car(0, "saloon")
-        >>> bool(car_part_labels(car, np.array([[0.5 * car.length, -0.02 - car.ground_clearance, 0.0]]))[0] == TRIM)
-        True
     """
     x, height, side = points_obj[:, 0], -points_obj[:, 1], np.abs(points_obj[:, 2])
     labels = np.full(len(points_obj), PAINT, dtype=np.int64)

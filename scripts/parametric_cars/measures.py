@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -49,10 +49,6 @@ class CarParameters:
     bow_rear: float
     roof_crown: float  # by which roof and bonnet fall from the middle towards the sides
     edge_radius: float  # of the edges between the sides and roof, bonnet and ends
-
-    def as_dict(self) -> dict[str, float | str]:
-        """All measures by name, for a file."""
-        return asdict(self)
 
 
 # Columns of the table below, mean and standard deviation each but `share` and `clearance`. Positions are shares of the
@@ -128,12 +124,6 @@ def sample_car(seed: int | np.random.Generator, body_type: str | None = None) ->
 
     Raises:
         InputError: unknown body type.
-
-    Examples:
-        >>> sample_car(0, "saloon").body_type
-        'saloon'
-        >>> sample_car(7) == sample_car(7)
-        True
     """
     rng = np.random.default_rng(seed)
     if body_type is None:
