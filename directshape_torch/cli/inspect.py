@@ -1,7 +1,7 @@
 """`directshape inspect`: figures of single cars.
 
 Refine the cars of a frame and draw the course of every one: sampled pixels, residuals, contour, box and costs of each
-iteration, and how it would drift by silhouettes alone. docs/inspect.md shows the pictures.
+iteration, and how it would drift by silhouettes alone. docs/outputs.md shows the pictures.
 """
 
 from __future__ import annotations

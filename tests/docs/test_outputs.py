@@ -3,15 +3,37 @@
 from __future__ import annotations
 
 import re
+from dataclasses import fields
 from pathlib import Path
 
 from helpers.finished_run import FinishedRun
 
+from directshape_torch.cli.inspect import _FIGURES
 from directshape_torch.export.box_files import DETECTION_NAMES, KITTI_TYPES
 from directshape_torch.export.export_run import FORMATS
 from directshape_torch.export.painted_cars import NEUTRAL_RGB
+from directshape_torch.visualize.refinement_trace import RefinementTrace
 
-TEXT = (Path(__file__).parent.parent.parent / "docs" / "outputs.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).parents[2] / "docs"
+TEXT = (DOCS / "outputs.md").read_text(encoding="utf-8")
+
+
+def test_pictures_are_small() -> None:
+    for name in re.findall(r"\]\((images/[^)]+)\)", TEXT):
+        assert (DOCS / name).stat().st_size < 400_000, name
+
+
+def test_every_picture_of_inspect_is_listed() -> None:
+    table = TEXT[TEXT.index("| file | shows |") : TEXT.index("## For other programs")]
+    listed = set(re.findall(r"^\| `([\w.]+)` \|", table, re.MULTILINE))
+    assert listed == {*_FIGURES, "drift.png"}
+
+
+def test_what_a_trace_is_said_to_have_exists() -> None:
+    known = {f.name for f in fields(RefinementTrace)} | {"T_cam_obj", "codes"}
+    said = set(re.findall(r"^trace\.(\w+)", TEXT, re.MULTILINE))
+    assert said
+    assert said <= known
 
 
 def test_every_format_has_a_row() -> None:
