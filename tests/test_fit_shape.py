@@ -169,4 +169,4 @@ def test_scans_need_their_data_set(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main([*words, "--data", str(root)]) == 2
     assert "--lidar: expected a scan of frame 000003" in capsys.readouterr().err
     with pytest.raises(InputError, match="lidar_dir"):
-        fit_scan(open_dataset("kitti", root, boxes), "000003")
+        fit_scan(open_dataset("kitti", root, boxes), "000003", tmp_path)

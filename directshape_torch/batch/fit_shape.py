@@ -13,7 +13,6 @@ from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.numerics.checks import check_shape
@@ -91,15 +90,13 @@ def fit_shape(
     check_shape("points", points, ("P", 3), kind="floating")
     T_points_obj, hwl = boxes_to_poses(boxes, convention, torch.eye(4))  # their frame stands for the camera
     points = points.to(boxes)
-    count = len(boxes)
-    ahead = torch.tensor([0.0, _CAMERA_HEIGHT_M, _DISTANCE_M]).to(boxes).expand(count, 3)
-    # Turned by 45 degrees, for nothing to be degenerate.
-    T_cam_obj = pose_from_kitti(ahead, torch.full_like(ahead[:, 0], math.pi / 4))
+    frames, detections = _scene(hwl)
+    T_cam_obj = detections.T_cam_obj
     samples, T_cam_points = _points_of_boxes(points, T_points_obj, T_cam_obj, hwl)
     fitter = _fitter(prior, samples).to(boxes)
     with torch.no_grad():
-        fitted = _without_points_unknown(fitter(*_scene(T_cam_obj, hwl)), samples.counts, T_cam_obj)
-        before = replace(fitted, T_cam_obj=T_cam_obj, code=fitter.prior.initial_code(count).to(boxes))
+        fitted = _without_points_unknown(fitter(frames, detections), samples.counts, T_cam_obj)
+        before = replace(fitted, T_cam_obj=T_cam_obj, code=fitter.prior.initial_code(len(boxes)).to(boxes))
         distances = [_distances(samples, cars) for cars in (before, fitted)]
     T_fitted = se3.inverse(T_cam_points) @ fitted.T_cam_obj
     kept = torch.where(fitted.refined[:, None, None], T_fitted, T_points_obj)
@@ -115,14 +112,10 @@ def _fitter(prior: ShapePrior | None, samples: PointSamples) -> DirectShapeRefin
     of_points = replace(plain.point_cloud, min_points=_LEAST_POINTS)
 
     def point_term(_: FrameBatch, __: Detections, cars: CarBatch, ___: ShapePrior) -> PointCloud:
-        return PointCloud.of_points(of_points, samples.of_objects(_kept(cars, len(samples.counts))))
+        is_kept = torch.zeros_like(samples.counts, dtype=torch.bool).index_fill(0, cars.detection_row, True)
+        return PointCloud.of_points(of_points, samples.of_objects(is_kept))
 
     return DirectShapeRefiner(prior, config, extra_terms=[point_term])
-
-
-def _kept(cars: CarBatch, count: int) -> Tensor:
-    keep = torch.zeros(count, dtype=torch.bool, device=cars.detection_row.device)
-    return keep.index_fill(0, cars.detection_row, True)
 
 
 def _without_points_unknown(cars: RefinementResult, counts: Tensor, T_cam_obj: Tensor) -> RefinementResult:
@@ -158,27 +151,17 @@ def _points_of_boxes(
     return samples, T_cam_points
 
 
-def _scene(T_cam_obj: Tensor, hwl: Tensor) -> tuple[FrameBatch, Detections]:
+def _scene(hwl: Tensor) -> tuple[FrameBatch, Detections]:
     """Cars before a camera that sees nothing."""
-    K = torch.tensor([[32.0, 0.0, 16.0], [0.0, 32.0, 16.0], [0.0, 0.0, 1.0]]).to(T_cam_obj)
-    black = torch.zeros(3, 32, 32).to(T_cam_obj)
+    K = torch.tensor([[32.0, 0.0, 16.0], [0.0, 32.0, 16.0], [0.0, 0.0, 1.0]]).to(hwl)
+    black = torch.zeros(3, 32, 32).to(hwl)
     frames = FrameBatch.from_images(black, black, StereoCamera.from_intrinsics(K, 0.5), _CAMERA_HEIGHT_M)
-    count = len(hwl)
+    # Turned by 45 degrees, for nothing to be degenerate.
+    place = hwl.new_tensor([0.0, _CAMERA_HEIGHT_M, _DISTANCE_M, math.pi / 4]).expand(len(hwl), 4)
+    boxes = torch.cat([place[:, :3], hwl, place[:, 3:]], dim=1)
     # Masks of everything: without any, a refiner leaves a car alone.
-    mask = torch.ones(count, 32, 32, dtype=torch.bool, device=hwl.device)
-    absent = torch.zeros(count, dtype=torch.bool, device=hwl.device)
-    detections = Detections(
-        frame_index=torch.zeros(count, dtype=torch.long, device=hwl.device),
-        T_cam_obj=T_cam_obj,
-        dimensions_hwl=hwl,
-        box_2d=hwl.new_full((count, 4), torch.nan),
-        score=hwl.new_ones(count),
-        mask_left=mask,
-        mask_right=mask,
-        has_mask_left=~absent,
-        has_mask_right=absent,
-    )
-    return frames, detections
+    everything = torch.ones(len(hwl), 32, 32, dtype=torch.bool, device=hwl.device)
+    return frames, Detections.from_boxes(boxes, "kitti", mask_left=everything)
 
 
 def _distances(samples: PointSamples, cars: RefinementResult) -> Tensor:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_bytes, write_png
 from directshape_torch.files.mesh_files import T_GLTF_CAM
 from directshape_torch.geometry.box3d import alpha_from_kitti
+from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.result_files import (
     RefinedBox,
     ShapeArrays,
@@ -37,7 +38,7 @@ from directshape_torch.io.run_folder import (
 )
 from directshape_torch.io.run_manifest import FrameEntry, hash_bytes
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.refinement.result import RefinementResult
+from directshape_torch.refinement.result import KittiBoxes, RefinementResult
 
 if TYPE_CHECKING:
     import trimesh
@@ -61,14 +62,15 @@ def write_frame_outputs(
     earlier = _earlier_record(path, run, inputs)
     files = [result_path(out_dir, loaded.frame_id)]
     if options.meshes is not None:
-        files += _write_meshes(out_dir, loaded, result, options.meshes)
+        files += write_meshes(out_dir, loaded.frame_id, loaded.detected_objects, result, options.meshes)
     if options.overlays:
         from directshape_torch.visualize.overlay import overlay_of_frame
 
         files.append(overlay_path(out_dir, loaded.frame_id))
         write_png(files[-1], overlay_of_frame(loaded, result))
-    shapes = shape_arrays(loaded, result, prior_sha256)
-    write_result_text(files[0], loaded.input_objects, _refined_boxes(loaded, shapes, result.refined.tolist()))
+    boxes = result.boxes()
+    shapes = _shape_arrays(loaded, result, boxes, prior_sha256)
+    write_result_text(files[0], loaded.input_objects, refined_boxes(boxes, result.refined, loaded.row_of_detection))
     hashes = {file.relative_to(out_dir).as_posix(): hash_bytes(file.read_bytes()) for file in files}
     outputs, masks_right = set(options.outputs), int(loaded.detections.has_mask_right.sum())
     # Those of an earlier run stay.
@@ -87,35 +89,42 @@ def _earlier_record(path: Path, run: str, inputs: Mapping[str, str]) -> FrameRec
     return None
 
 
-def _write_meshes(out_dir: Path, loaded: LoadedFrame, result: RefinementResult, mesh_format: MeshFormat) -> list[Path]:
-    """The surface of each refined car of a frame in the left camera frame, metres.
+def write_meshes(
+    out_dir: Path, frame_id: str, lines: Sequence[KittiObject], result: RefinementResult, mesh_format: MeshFormat
+) -> list[Path]:
+    """The surface of each refined car of a frame in the left camera frame, metres; returns the files.
 
     GLB files hold the same vertices as PLY files below a node that turns them into glTF's axes (y up).
     """
     paths, refined = [], result.refined.tolist()
-    for car, line in enumerate(loaded.detected_objects):
+    for car, line in enumerate(lines):
         if refined[car]:
-            paths.append(mesh_path(out_dir, loaded.frame_id, line.line_number, mesh_format))
+            paths.append(mesh_path(out_dir, frame_id, line.line_number, mesh_format))
             write_bytes(paths[-1], _mesh_bytes(result.mesh(car), mesh_format))
     return paths
 
 
+def refined_boxes(boxes: KittiBoxes, refined: Tensor, rows: Sequence[int]) -> dict[int, RefinedBox]:
+    """The new box of each refined car, by its row of the input; all other rows keep their line."""
+    hwl, location, yaw = (each.double().cpu() for each in (boxes.dimensions_hwl, boxes.location_ref, boxes.rotation_y))
+    columns = torch.cat([alpha_from_kitti(location, yaw)[:, None], hwl, location, yaw[:, None]], dim=1).tolist()
+    return {row: columns[car] for car, row in enumerate(rows) if refined[car]}
+
+
 def _mesh_bytes(mesh: trimesh.Trimesh, mesh_format: MeshFormat) -> bytes:
     import trimesh
-    from trimesh.exchange.gltf import export_glb
-    from trimesh.exchange.ply import export_ply
+    from trimesh.exchange import gltf, ply
 
-    export: Callable[..., bytes] = export_ply if mesh_format == "ply" else export_glb
+    to_glb: Callable[..., bytes] = gltf.export_glb
     if mesh_format == "ply":
-        return export(mesh)
+        return cast(bytes, ply.export_ply(mesh))
     scene = trimesh.Scene()
     scene.add_geometry(mesh, node_name="car", geom_name="car", transform=T_GLTF_CAM)
-    return export(scene, include_normals=True)
+    return to_glb(scene, include_normals=True)
 
 
-def shape_arrays(loaded: LoadedFrame, result: RefinementResult, prior_sha256: str) -> ShapeArrays:
+def _shape_arrays(loaded: LoadedFrame, result: RefinementResult, boxes: KittiBoxes, prior_sha256: str) -> ShapeArrays:
     """What `shapes/NNNNNN.npz` holds, but for its record."""
-    boxes = result.boxes()
     lines = [loaded.input_objects[row].line_number for row in loaded.row_of_detection]
     return ShapeArrays(
         frame_id=loaded.frame_id,
@@ -164,17 +173,6 @@ def _tracks(loaded: LoadedFrame) -> tuple[str, ...]:
 
 def _numpy(tensor: Tensor) -> NDArray[Any]:
     return np.asarray(tensor.detach().cpu().numpy())
-
-
-def _refined_boxes(loaded: LoadedFrame, shapes: ShapeArrays, refined: Sequence[bool]) -> dict[int, RefinedBox]:
-    """The new box of each input line whose car was refined; all others keep their line."""
-    location_ref, rotation_y = (
-        torch.from_numpy(array).double() for array in (shapes.boxes_location_ref, shapes.boxes_rotation_y)
-    )
-    alpha = alpha_from_kitti(location_ref, rotation_y).numpy()
-    columns = (alpha, shapes.boxes_hwl, shapes.boxes_location_ref, shapes.boxes_rotation_y)
-    boxes = np.column_stack([column.astype(np.float64) for column in columns]).tolist()
-    return {line: boxes[car] for car, line in enumerate(loaded.row_of_detection) if refined[car]}
 
 
 def failed_entry(reason: str) -> FrameEntry:

@@ -6,7 +6,7 @@ import gc
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -14,7 +14,7 @@ import torch
 from directshape_torch.batch.frame_groups import FrameGroup
 from directshape_torch.batch.frame_outputs import failed_entry, write_frame_outputs
 from directshape_torch.batch.options import RefineOptions
-from directshape_torch.batch.run_log import OutputLostError
+from directshape_torch.batch.run_log import OutputLostError, writing_to
 from directshape_torch.batch.run_summary import RunTimings, peak_device_memory_mb, peak_memory_mb
 from directshape_torch.compile import cars_ahead
 from directshape_torch.errors import CompilationError, DirectShapeError, MissingDependencyError
@@ -48,7 +48,7 @@ class GroupReport:
     """What became of a group."""
 
     ends: dict[str, FrameEntry]  # what `summary.json` says of its frames, in the order in which they ended
-    timings: RunTimings  # of its calls and of this process so far
+    timings: RunTimings = field(default_factory=RunTimings)  # of its calls and of this process so far
     num_halved: int = 0  # calls that did not work and were tried again with half of the frames
     stopped: str | None = None  # why no other frame could be refined either, or None
 
@@ -86,7 +86,8 @@ class _GroupStep:
         if problem is None:
             return
         # Only now, when the traceback and with it the tensors of the call are gone.
-        _free_memory(self.job.refiner.prior.origin.device)
+        gc.collect()
+        torch.cuda.empty_cache()
         if len(frame_ids) == 1:
             self._fail(frame_ids[0], problem)
             return
@@ -98,24 +99,21 @@ class _GroupStep:
         """Why these frames cannot be refined together, or None where each of them has ended."""
         try:
             batch = [ready for ready in map(self._read, frame_ids) if ready is not None]
-            parts = split_by_rig([loaded for loaded, _ in batch])
-            results = [self._call([batch[k] for k in part]) for part in parts]
+            parts = [[batch[k] for k in part] for part in split_by_rig([loaded for loaded, _ in batch])]
+            results = [self._call([loaded for loaded, _ in part]) for part in parts]
         except _STOPS_THE_RUN:
             raise
         # Whatever a frame of a hundred thousand brings to light: it is reported, and the others go on.
         except Exception as error:
             return _with_memory_advice(error, len(frame_ids))
         for part, result in zip(parts, results, strict=True):
-            self._write_all([batch[k] for k in part], result)
+            first_row = 0
+            for loaded, inputs in part:
+                end_row = first_row + len(loaded.detections)
+                if loaded.frame_id in self.group.wanted:
+                    self._write(loaded, inputs, result[first_row:end_row])
+                first_row = end_row
         return None
-
-    def _write_all(self, batch: Sequence[_Ready], result: RefinementResult) -> None:
-        first_row = 0
-        for loaded, inputs in batch:
-            end_row = first_row + len(loaded.detections)
-            if loaded.frame_id in self.group.wanted:
-                self._write(loaded, inputs, result[first_row:end_row])
-            first_row = end_row
 
     def _read(self, frame_id: str) -> _Ready | None:
         try:
@@ -127,9 +125,9 @@ class _GroupStep:
             self._fail(frame_id, _reason(error))
             return None
 
-    def _call(self, batch: Sequence[_Ready]) -> RefinementResult:
+    def _call(self, batch: Sequence[LoadedFrame]) -> RefinementResult:
         prior = self.job.refiner.prior.origin
-        frames, detections = collate([loaded for loaded, _ in batch])
+        frames, detections = collate(batch)
         frames, detections = frames.to(prior.device, prior.dtype), detections.to(prior.device, prior.dtype)
         # Said anew before each call, so that it does not matter which calls this process had before.
         with cars_ahead(self.job.expected_cars), self.report.timings.measure(frames.frame_ids, len(detections)):
@@ -139,16 +137,13 @@ class _GroupStep:
     def _write(self, loaded: LoadedFrame, inputs: dict[str, str], result: RefinementResult) -> None:
         job = self.job
         try:
-            entry = write_frame_outputs(job.out_dir, loaded, result, job.run, job.prior_sha256, inputs, job.options)
+            with writing_to(job.out_dir):
+                entry = write_frame_outputs(job.out_dir, loaded, result, job.run, job.prior_sha256, inputs, job.options)
+            self.report.ends[loaded.frame_id] = entry
         except _STOPS_THE_RUN:
             raise
         except (DirectShapeError, OSError) as error:
-            lost = OutputLostError.told_by(error, job.out_dir) if isinstance(error, OSError) else None
-            if lost is not None:
-                raise lost from error
             self._fail(loaded.frame_id, _reason(error))
-            return
-        self.report.ends[loaded.frame_id] = entry
 
     def _fail(self, frame_id: str, reason: str) -> None:
         # A finished frame that was only to keep the others company stays finished.
@@ -179,22 +174,9 @@ def _reason(error: Exception) -> str:
 
 
 def _with_memory_advice(error: Exception, num_frames: int) -> str:
-    if not _is_out_of_memory(error):
+    # On the CPU PyTorch and OpenCV have no class of exception for it.
+    signs = ("can't allocate memory", "Insufficient memory", "CUDA out of memory")
+    if not isinstance(error, (MemoryError, torch.OutOfMemoryError)) and not any(sign in str(error) for sign in signs):
         return _reason(error)
     what = "1 frame" if num_frames == 1 else f"{num_frames} frames"
     return f"too little memory for {what} in a call ({_reason(error)[:200]})"
-
-
-def _is_out_of_memory(error: BaseException) -> bool:
-    """Whether memory was lacking; on the CPU PyTorch and OpenCV have no class of exception for that."""
-    if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
-        return True
-    text = str(error)
-    return any(sign in text for sign in ("can't allocate memory", "Insufficient memory", "CUDA out of memory"))
-
-
-def _free_memory(device: torch.device) -> None:
-    gc.collect()
-    if device.type == "cuda":
-        with torch.cuda.device(device):
-            torch.cuda.empty_cache()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,24 +13,23 @@ import torch
 
 from directshape_torch.batch.frame_groups import FrameGroup, frame_groups, track_windows
 from directshape_torch.batch.frame_outputs import failed_entry
-from directshape_torch.batch.group_refinement import GroupReport, RunJob, limited_threads
+from directshape_torch.batch.group_refinement import GroupReport, RunJob, limited_threads, refine_group
 from directshape_torch.batch.options import RefineOptions, RunObserver
 from directshape_torch.batch.resumption import OUTPUT_FOLDERS, EarlierResults, remove_results, remove_unfinished_files
 from directshape_torch.batch.run_log import RunBeginning, RunLog, digit_warnings, read_log
 from directshape_torch.batch.run_summary import RunSummary, RunTimings, find_warnings, write_timings
-from directshape_torch.batch.workers import GroupDispatch, LocalWorkers, ThisProcess, Workers
+from directshape_torch.batch.workers import LocalWorkers, reports_of
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.io.config_files import config_to_mapping
 from directshape_torch.io.result_files import read_shapes, write_tracks
 from directshape_torch.io.run_folder import done_frames, overlay_path, result_path, shapes_path
-from directshape_torch.io.run_manifest import FrameEntry, RunManifest, SharedHashes, hash_fields, hash_prior
+from directshape_torch.io.run_manifest import RunManifest, SharedHashes, hash_fields, hash_prior
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
 
 # Detection files that tell how many cars are ahead.
 _FRAMES_COUNTED = 50
-_TIMINGS = "timings.json"
 
 
 def refine_dataset(
@@ -66,7 +65,7 @@ def refine_dataset(
     _check_out_dir(dataset, out_dir)
     with RunLog(out_dir) as log, limited_threads(options.threads if options.workers is None else None):
         remove_unfinished_files(out_dir)
-        is_cleared = fresh and remove_results(out_dir, (_TIMINGS,))
+        is_cleared = fresh and remove_results(out_dir)
         manifest = run_manifest(dataset, refiner, options.batch_frames)
         earlier = EarlierResults(out_dir, manifest, options.outputs, is_cleared)
         # Of all frames, also of those that are finished: after an interruption the decision must be the same.
@@ -94,7 +93,7 @@ class _Run:
             resumed += self.earlier.finished_frames(self.dataset)
             groups = self._groups(resumed)
             if groups and resumed and before is not None:
-                self.warnings += digit_warnings(before.beginning, now)
+                self.warnings += digit_warnings(before[0], now)
             self.log.refining(len(resumed))
             self.observer.started([name for group in groups for name in group.frame_ids if name in group.wanted])
             if groups:
@@ -119,49 +118,33 @@ class _Run:
         return frame_groups(dataset.frame_ids, size, finished)
 
     def _refine(self, groups: Sequence[FrameGroup]) -> None:
-        start, workers = time.perf_counter(), self._workers()
-        dispatch = GroupDispatch(groups, workers, self.options.retries, self._finished)
-        try:
-            for report in dispatch.reports():
-                self._take_in(report)
-        finally:
-            workers.close()
-            self.timings.wall_s = time.perf_counter() - start
-        for frame_id, reason in dispatch.lost.items():
-            self._note(frame_id, failed_entry(reason))
-
-    def _workers(self) -> Workers:
-        number, threads = self.options.workers, self.options.threads_per_worker
-        if number is None:
-            return ThisProcess(self.job)
-        self.timings.threads, self.timings.workers = threads or 1, number
-        return LocalWorkers(self.job, number, threads)
+        start, options = time.perf_counter(), self.options
+        with contextlib.ExitStack() as stack:
+            reports: Iterator[GroupReport] = (refine_group(self.job, group) for group in groups)
+            if options.workers is not None:
+                self.timings.threads, self.timings.workers = options.threads_per_worker or 1, options.workers
+                workers = stack.enter_context(LocalWorkers(self.job, options.workers, options.threads_per_worker))
+                reports = reports_of(workers, groups, options.retries, self.earlier.entry)
+            try:
+                for report in reports:
+                    self._take_in(report)
+            finally:
+                self.timings.wall_s = time.perf_counter() - start
 
     def _take_in(self, report: GroupReport) -> None:
         self.timings.add(report.timings)
         self.num_halved += report.num_halved
         for frame_id, entry in report.ends.items():
-            self._note(frame_id, entry)
+            self.frames[frame_id] = entry
+            self.log.frame(frame_id, entry.get("reason"))
+            self.observer.finished(frame_id, entry.get("reason"))
         if report.stopped is not None:
             raise DirectShapeError(report.stopped)
-
-    def _note(self, frame_id: str, entry: FrameEntry) -> None:
-        self.frames[frame_id] = entry
-        self.log.frame(frame_id, entry.get("reason"))
-        self.observer.finished(frame_id, entry.get("reason"))
-
-    def _finished(self, frame_ids: Collection[str]) -> Collection[str]:
-        """Which frames are finished after all; for the group of a worker that died."""
-        found = {frame_id: self.earlier.entry(frame_id) for frame_id in sorted(frame_ids)}
-        done = {frame_id: entry for frame_id, entry in found.items() if entry is not None}
-        for frame_id, entry in done.items():
-            self._note(frame_id, entry)
-        return done
 
     def _end(self, resumed: Sequence[str], reason: str | None) -> RunSummary:
         """Write what is known at the end of the run, whatever end that is."""
         if self.timings.calls:
-            write_timings(self.out_dir / _TIMINGS, self.timings)
+            write_timings(self.out_dir, self.timings)
         self.earlier.write()
         summary = self._summary(resumed)
         self.log.end(len(summary.frames) - len(summary.failed), summary.failed, reason)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
+from directshape_torch.batch.run_summary import TIMINGS
 from directshape_torch.errors import DataFormatError, ResumeError
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import (
@@ -33,6 +35,7 @@ from directshape_torch.io.run_manifest import (
 )
 from directshape_torch.io.stereo_dataset import StereoDataset
 
+_Found = TypeVar("_Found")
 # Hashing waits for the disk most of the time, and for a network's even longer.
 _READING_THREADS = 8
 _MESH = re.compile(r"(.+)_[0-9]{1,9}\.(ply|glb)")
@@ -68,19 +71,15 @@ class EarlierResults:
         """
         frames, done = self.manifest.frames, set(done_frames(self.out_dir))
         known = [f for f in dataset.frame_ids if f in done or (f in frames and frames[f]["state"] == "done")]
-        with ThreadPoolExecutor(_READING_THREADS) as threads:
-            checked = list(threads.map(partial(self._checked, dataset), known))
+        checked = _in_threads(partial(self._checked, dataset), known)
         # Of frames that nobody asks for now the summary tells all the same.
         self.take_in(done.difference(dataset.frame_ids))
-        found = dict[str, FrameEntry]()
-        for frame_id, (entry, is_damaged) in zip(known, checked, strict=True):
-            if is_damaged:
-                self.remade.append(frame_id)
-                frames.pop(frame_id, None)
-                with suppress(OSError):
-                    result_path(self.out_dir, frame_id).unlink()
-            elif entry is not None:
-                found[frame_id] = entry
+        found = {frame_id: entry for frame_id, (entry, _) in checked.items() if entry is not None}
+        self.remade = [frame_id for frame_id, (_, is_damaged) in checked.items() if is_damaged]
+        for frame_id in self.remade:
+            frames.pop(frame_id, None)
+            with suppress(OSError):
+                result_path(self.out_dir, frame_id).unlink()
         frames.update(found)
         return list(found)
 
@@ -88,9 +87,8 @@ class EarlierResults:
         """Let the summary tell of frames that are done, which nobody has noted."""
         frames = self.manifest.frames
         unknown = sorted(f for f in frame_ids if f not in frames or frames[f]["state"] == "failed")
-        with ThreadPoolExecutor(_READING_THREADS) as threads:
-            entries = zip(unknown, threads.map(self.entry, unknown), strict=True)
-            frames.update({frame_id: entry for frame_id, entry in entries if entry is not None})
+        entries = _in_threads(self.entry, unknown)
+        frames.update({frame_id: entry for frame_id, entry in entries.items() if entry is not None})
 
     def entry(self, frame_id: str) -> FrameEntry | None:
         """That of a frame which has all outputs of this run, and nobody has removed or changed them since."""
@@ -109,18 +107,15 @@ class EarlierResults:
             record = read_record(path, read_shapes(path))
         except DataFormatError:
             return None, True
-        self._check_inputs(dataset, frame_id, record.inputs)
-        entry = self.entry(frame_id)
-        return entry, entry is None and set(self.outputs) <= set(record.outputs)
-
-    def _check_inputs(self, dataset: StereoDataset, frame_id: str, inputs: Mapping[str, str]) -> None:
         try:
             hashes = hash_files(dataset.input_files(frame_id))
         except DataFormatError as error:
             raise ResumeError(
                 f"cannot resume: frame {frame_id} was refined from a file that is gone: {error}; {RESUME_CURE}"
             ) from error
-        check_mapping(f"frame {frame_id}: sha256 of", inputs, hashes)
+        check_mapping(f"frame {frame_id}: sha256 of", record.inputs, hashes)
+        entry = self.entry(frame_id)
+        return entry, entry is None and set(self.outputs) <= set(record.outputs)
 
     def _check_empty(self) -> None:
         for name in ("data", "shapes"):
@@ -132,6 +127,11 @@ class EarlierResults:
                 )
 
 
+def _in_threads(read: Callable[[str], _Found], frame_ids: Sequence[str]) -> dict[str, _Found]:
+    with ThreadPoolExecutor(_READING_THREADS) as threads:
+        return dict(zip(frame_ids, threads.map(read, frame_ids), strict=True))
+
+
 def remove_unfinished_files(out_dir: Path) -> None:
     """Remove temporary files of processes that were killed while they wrote; only for who holds the folder."""
     for folder in (out_dir, *(out_dir / name for name in OUTPUT_FOLDERS)):
@@ -139,23 +139,23 @@ def remove_unfinished_files(out_dir: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def remove_results(out_dir: Path, others: Iterable[str]) -> bool:
+def remove_results(out_dir: Path) -> bool:
     """Remove what runs have written into a folder, and nothing else; without a summary, and False, nothing."""
     previous = read_manifest(summary_path(out_dir))
     if previous is None:
         return False
     frame_ids = {*previous.frames, *done_frames(out_dir)}
     for frame_id in frame_ids:
-        for path in (result_path, shapes_path, overlay_path):
-            path(out_dir, frame_id).unlink(missing_ok=True)
+        for path_of in (result_path, shapes_path, overlay_path):
+            path_of(out_dir, frame_id).unlink(missing_ok=True)
     for mesh in (out_dir / "meshes").glob("*"):
         if (found := _MESH.fullmatch(mesh.name)) is not None and found[1] in frame_ids:
             mesh.unlink()
     for track in (out_dir / "tracks").glob("*.npz"):
         if _TRACK.fullmatch(track.name) is not None:
             track.unlink()
-    for name in (*others, summary_path(out_dir).name):
-        (out_dir / name).unlink(missing_ok=True)
+    for path in (out_dir / TIMINGS, summary_path(out_dir)):
+        path.unlink(missing_ok=True)
     for name in OUTPUT_FOLDERS:
         with suppress(OSError):  # files of somebody else stay, and their folder with them
             (out_dir / name).rmdir()

@@ -13,8 +13,8 @@ import os
 import platform
 import stat
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, Any, Literal, Self
@@ -41,15 +41,19 @@ _DIGITS = ("threads", "batch_frames", "device")
 class OutputLostError(DirectShapeError):
     """The output folder takes nothing more."""
 
-    @classmethod
-    def told_by(cls, error: OSError, out_dir: Path) -> OutputLostError | None:
-        """For an error that says so, else None."""
+
+@contextmanager
+def writing_to(out_dir: Path) -> Iterator[None]:
+    """Tells of a full disk in the body by an `OutputLostError`."""
+    try:
+        yield
+    except OSError as error:
         if error.errno not in _DISK_IS_FULL:
-            return None
-        return cls(
+            raise
+        raise OutputLostError(
             f"cannot write to {out_dir} any more ({error.strerror or error}): make room there and run the same command "
             "again; what is finished stays finished"
-        )
+        ) from error
 
 
 def _versions() -> dict[str, str]:
@@ -72,8 +76,6 @@ class RunBeginning:
     host: str = field(default_factory=platform.node)
     pid: int = field(default_factory=os.getpid)
     started_at: float = field(default_factory=time.time)  # seconds since 1970, like all times
-    # Operating system and processor.
-    machine: str = field(default_factory=lambda: f"{platform.system()} {platform.machine()}")
     versions: Mapping[str, str] = field(default_factory=_versions)  # of Python and of the packages that compute
 
     @property
@@ -111,16 +113,6 @@ class RunEvent:
     reason: str | None = None
 
 
-@dataclass(frozen=True)
-class LogContents:
-    """What a log says of the latest run."""
-
-    beginning: RunBeginning  # its first line
-    frames: Mapping[str, RunEvent]  # the ends of frames so far, by name
-    refining: RunEvent | None  # after the check of what earlier runs left, or None
-    end: RunEvent | None  # or None; a run that was killed says nothing
-
-
 class RunLog:
     """Holds a folder while the body runs; the operating system lets go of it however the process ends.
 
@@ -133,22 +125,38 @@ class RunLog:
 
     def __enter__(self) -> Self:
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        while self._file is None:
-            self._file = self._locked()
+        # A link is no lock: it would empty what it leads to.
+        try:
+            file = open(self.path, "a+b", buffering=0, opener=_opened)
+        except OSError as error:
+            problem = f"cannot be written ({error.strerror})"
+            raise DataFormatError(self.path, problem, cure="remove it, or choose another output folder") from error
+        try:
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not self._is_at_its_place(file):
+                raise BlockingIOError("its last owner has just removed it")
+            read_log(self.out_dir)
+        except (BlockingIOError, FileNotFoundError) as error:
+            file.close()
+            raise RunInProgressError(
+                f"{self.out_dir}: another run is writing here ({self._owner()}); wait for it, stop it, or choose "
+                "another output folder ('directshape status' shows how far it is)"
+            ) from error
+        except DataFormatError:
+            file.close()
+            raise
+        self._file = file
         return self
 
     def __exit__(self, *_: object) -> None:
         file, self._file = self._file, None
-        if file is None:
-            return
-        try:
+        assert file is not None, "the folder is held"
+        with file, suppress(OSError):
             # A run that never began leaves no log. Removed before it is let go of, so that nobody locks a file that is
             # about to vanish; of a moved folder it may be another run's by now.
-            with suppress(OSError):
-                if not os.fstat(file.fileno()).st_size and self._is_at_its_place(file):
-                    self.path.unlink()
-        finally:
-            file.close()
+            if not os.fstat(file.fileno()).st_size and self._is_at_its_place(file):
+                self.path.unlink()
 
     def begin(self, beginning: RunBeginning) -> None:
         """Forget the run before and write the first line."""
@@ -176,49 +184,23 @@ class RunLog:
         assert file is not None, "the folder is held"
         length = os.fstat(file.fileno()).st_size
         rest = memoryview(json.dumps(content, allow_nan=False).encode() + b"\n")
-        try:
-            while rest:
-                rest = rest[file.write(rest) :]
-        except OSError as error:
-            file.truncate(length)
-            if (lost := OutputLostError.told_by(error, self.out_dir)) is not None:
-                raise lost from error
-            raise
+        with writing_to(self.out_dir):
+            try:
+                while rest:
+                    rest = rest[file.write(rest) :]
+            except OSError:
+                file.truncate(length)
+                raise
 
     def _is_at_its_place(self, file: IO[bytes]) -> bool:
         """Whether the path still leads to the file that is held."""
         return os.path.samestat(os.fstat(file.fileno()), self.path.stat())
 
-    def _locked(self) -> IO[bytes] | None:
-        """The file, held; None where its last owner removed it in between."""
-        # A link is no lock: it would empty what it leads to.
-        try:
-            file = open(self.path, "a+b", buffering=0, opener=_opened)  # noqa: SIM115
-        except OSError as error:
-            problem = f"cannot be written ({error.strerror})"
-            raise DataFormatError(self.path, problem, cure="remove it, or choose another output folder") from error
-        try:
-            if fcntl is not None:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if self._is_at_its_place(file):
-                read_log(self.out_dir)
-                return file
-        except BlockingIOError as error:
-            file.close()
-            with suppress(DataFormatError):
-                log = read_log(self.out_dir)
-            owner = "its owner is not known" if log is None else log.beginning.owner
-            raise RunInProgressError(
-                f"{self.out_dir}: another run is writing here ({owner}); wait for it, stop it, or choose another "
-                "output folder ('directshape status' shows how far it is)"
-            ) from error
-        except FileNotFoundError:
-            pass
-        except DataFormatError:
-            file.close()
-            raise
-        file.close()
-        return None
+    def _owner(self) -> str:
+        with suppress(DataFormatError):
+            if (log := read_log(self.out_dir)) is not None:
+                return log[0].owner
+        return "its owner is not known"
 
 
 def _opened(path: str, flags: int) -> int:
@@ -234,51 +216,37 @@ def log_path(out_dir: Path) -> Path:
     return out_dir / "run.jsonl"
 
 
-def read_log(out_dir: Path) -> LogContents | None:
-    """The latest run into a folder, also while it goes on; None where none has begun."""
-    path = log_path(out_dir)
+def read_log(out_dir: Path) -> tuple[RunBeginning, list[RunEvent]] | None:
+    """What the log says of the latest run into a folder, also while it goes on; None where none has begun."""
+    path, cure = log_path(out_dir), "remove it; results do not need it"
     if not path.is_file():
         return None
     first, is_whole, rest = read_bytes(path).partition(b"\n")
     if not is_whole and first[: len(_BEGINNING)] == _BEGINNING[: len(first)]:  # cut short, or not yet written
         return None
-    beginning = _beginning(path, first)
-    events = []
-    for line in rest.splitlines():
-        with suppress(DataFormatError):  # it was cut short
-            events.append(record_of(path, RunEvent, parse_json(path, line)))
-    return LogContents(
-        beginning,
-        {event.frame: event for event in events if event.frame is not None},
-        next((event for event in events if event.resumed is not None), None),
-        next((event for event in events if event.end is not None), None),
-    )
-
-
-def _beginning(path: Path, line: bytes) -> RunBeginning:
-    cure = "remove it; results do not need it"
-    content = parse_json(path, line, cure)
+    content = parse_json(path, first, cure)
     if not isinstance(content, dict) or content.pop("schema", None) != "directshape run":
         raise DataFormatError(path, "describes no run", cure=cure)
     version = content.pop("schema_version", None)
     if version != LOG_SCHEMA_VERSION:
         raise DataFormatError(path, f"schema version is {shown(version)}, known is {LOG_SCHEMA_VERSION}", cure=cure)
-    return record_of(path, RunBeginning, content, cure)
+    events = []
+    for line in rest.splitlines():
+        with suppress(DataFormatError):  # it was cut short
+            events.append(record_of(path, RunEvent, parse_json(path, line)))
+    return record_of(path, RunBeginning, content, cure), events
 
 
-def digit_warnings(before: RunBeginning | None, now: RunBeginning) -> tuple[str, ...]:
+def digit_warnings(before: RunBeginning, now: RunBeginning) -> list[str]:
     """What differs from the previous run so that the last digits of further results may differ too.
 
     Examples:
         >>> digit_warnings(RunBeginning({"threads": 1}, 5), RunBeginning({"threads": 2}, 5))
-        ('threads: 1 in the previous run, 2 now; the last digits of results may differ',)
+        ['threads: 1 in the previous run, 2 now; the last digits of results may differ']
     """
-    if before is None:
-        return ()
-    was = {**before.versions, **{name: before.work.get(name) for name in _DIGITS}}
-    is_now = {**now.versions, **{name: now.work.get(name) for name in _DIGITS}}
-    return tuple(
-        f"{name}: {was.get(name)} in the previous run, {is_now[name]} now; the last digits of results may differ"
-        for name in is_now
-        if was.get(name) != is_now[name]
-    )
+    was, is_now = ({**run.versions, **{name: run.work.get(name) for name in _DIGITS}} for run in (before, now))
+    return [
+        f"{name}: {was.get(name)} in the previous run, {value} now; the last digits of results may differ"
+        for name, value in is_now.items()
+        if was.get(name) != value
+    ]

@@ -1,4 +1,4 @@
-"""How far a run is, while it goes on or after it was cut off: reads its files and changes nothing."""
+"""How far a run is, while it goes on or after it was cut off: reads its log and changes nothing."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from directshape_torch.batch.run_log import LogContents, read_log
+from directshape_torch.batch.run_log import read_log
 from directshape_torch.errors import DataFormatError
 
 # Frames of which the rate is: enough for a mean, few enough to follow a change of load.
@@ -39,26 +39,30 @@ class RunStatus:
 
 def read_status(out_dir: Path | str, now: float | None = None) -> RunStatus:
     """The status of the latest run into a folder, at a time (seconds since 1970), by default now."""
-    run = read_log(Path(out_dir))
-    if run is None:
+    log = read_log(Path(out_dir))
+    if log is None:
         raise DataFormatError(out_dir, "has no run.jsonl, so no run of 'directshape refine' is or was here")
-    is_alive = run.beginning.is_alive is not False
+    is_alive = log[0].is_alive is not False
     # It may have ended since it was read.
-    run = run if is_alive else read_log(Path(out_dir)) or run
-    end, is_alive = run.end, is_alive and run.end is None
-    resumed = (run.refining.resumed if run.refining else None) or 0
-    failed = {name: line.failure for name, line in run.frames.items() if line.failure is not None}
-    num_done = resumed + len(run.frames) - len(failed)
-    num_left = run.beginning.num_frames - resumed - len(run.frames)
-    times = sorted(line.at for line in run.frames.values())
-    rate = None if end is not None else _rate(run, times, (time.time() if now is None else now) if is_alive else None)
-    going = "checking" if run.refining is None else "running"
+    run, events = log if is_alive else read_log(Path(out_dir)) or log
+    frames = {event.frame: event for event in events if event.frame is not None}
+    checked = next((event for event in events if event.resumed is not None), None)
+    end = next((event for event in events if event.end is not None), None)
+    is_alive = is_alive and end is None
+    resumed = (checked and checked.resumed) or 0
+    failed = {name: event.failure for name, event in frames.items() if event.failure is not None}
+    times = sorted(event.at for event in frames.values())
+    rate = None
+    if end is None and checked is not None:
+        rate = _rate(checked.at, times, (time.time() if now is None else now) if is_alive else None)
+    num_left = run.num_frames - resumed - len(frames)
+    going = "checking" if checked is None else "running"
     return RunStatus(
         state=(end.end if end else None) or (going if is_alive else "killed"),
-        owner=run.beginning.owner if is_alive else None,
-        work=run.beginning.work,
-        num_frames=run.beginning.num_frames,
-        num_done=num_done if end is None else end.done,
+        owner=run.owner if is_alive else None,
+        work=run.work,
+        num_frames=run.num_frames,
+        num_done=resumed + len(frames) - len(failed) if end is None else end.done,
         num_resumed=resumed,
         failed=failed if end is None else end.failed,
         frames_per_s=rate,
@@ -68,13 +72,12 @@ def read_status(out_dir: Path | str, now: float | None = None) -> RunStatus:
     )
 
 
-def _rate(run: LogContents, all_times: Sequence[float], now: float | None) -> float | None:
+def _rate(start: float, all_times: Sequence[float], now: float | None) -> float | None:
     """Frames a second, of the latest ones; a run that is stuck becomes slower with every second that passes."""
     times = all_times[-_RECENT_FRAMES:]
-    if not times or run.refining is None:
+    if not times:
         return None
-    is_all = len(times) == len(all_times)
-    start, count = (run.refining.at, len(times)) if is_all else (times[0], len(times) - 1)
+    start, count = (start, len(times)) if len(times) == len(all_times) else (times[0], len(times) - 1)
     # The frames in work are between two ends, so the mean gap is past before a silence says anything.
     gap = (times[-1] - start) / count
     end = times[-1] if now is None else max(times[-1], now - gap)
@@ -84,26 +87,22 @@ def _rate(run: LogContents, all_times: Sequence[float], now: float | None) -> fl
 def format_status(status: RunStatus, now: float | None = None) -> str:
     """A few lines for people."""
     now = time.time() if now is None else now
-    lines = [f"run      {_state_text(status)}", _frames_text(status)]
+    earlier = f" ({status.num_resumed} of them in earlier runs)" if status.num_resumed else ""
+    percent = 100 * (1 - status.num_left / status.num_frames) if status.num_frames else 100
+    lines = [
+        f"run      {_state_text(status)}",
+        f"frames   {status.num_done} of {status.num_frames} done{earlier}, {len(status.failed)} failed, "
+        f"{status.num_left} left ({percent:.0f} %)",
+    ]
     if status.frames_per_s is not None:
         left = "" if status.seconds_left is None else f", about {_duration(status.seconds_left)} left"
         lines.append(f"rate     {status.frames_per_s:.2f} frames/s{left}")
     if status.last_frame_at is not None and status.state in ("running", "killed"):
         lines.append(f"latest   {_duration(max(0.0, now - status.last_frame_at))} ago")
-    for frame_id in sorted(status.failed)[:_SHOWN_FAILURES]:
-        lines.append(f"failed   {frame_id}: {status.failed[frame_id]}")
+    lines += [f"failed   {name}: {why}" for name, why in sorted(status.failed.items())[:_SHOWN_FAILURES]]
     if len(status.failed) > _SHOWN_FAILURES:
         lines.append(f"failed   .. and {len(status.failed) - _SHOWN_FAILURES} more")
     return "\n".join(lines)
-
-
-def _frames_text(status: RunStatus) -> str:
-    earlier = f" ({status.num_resumed} of them in earlier runs)" if status.num_resumed else ""
-    percent = 100 * (1 - status.num_left / status.num_frames) if status.num_frames else 100
-    return (
-        f"frames   {status.num_done} of {status.num_frames} done{earlier}, {len(status.failed)} failed, "
-        f"{status.num_left} left ({percent:.0f} %)"
-    )
 
 
 def _state_text(status: RunStatus) -> str:

@@ -17,7 +17,9 @@ from directshape_torch.compile import num_forms
 from directshape_torch.files.atomic_files import write_json
 from directshape_torch.status import Status
 
+TIMINGS = "timings.json"
 TIMINGS_SCHEMA_VERSION = 1
+_CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class CallTiming:
 class RunTimings:
     """All calls of a run, in order."""
 
-    device: torch.device  # where the refiner ran
+    device: torch.device = _CPU  # where the refiner ran
     calls: list[CallTiming] = field(default_factory=list)  # one entry a call
     workers: int = 1  # processes that refined side by side
     threads: int = field(default_factory=torch.get_num_threads)  # of each
@@ -64,21 +66,20 @@ class RunTimings:
     def num_frames(self) -> int:
         return sum(len(call.frame_ids) for call in self.calls)
 
+    def ms_per(self, number: int) -> float | None:
+        """Of all calls, over a number of cars or frames; None where there was none."""
+        return 1000 * sum(call.refine_s for call in self.calls) / number if number else None
+
     @property
     def ms_per_car(self) -> float | None:
-        """Mean over the cars of all calls, or None where there was none."""
-        return self._ms_per(sum(call.num_cars for call in self.calls))
+        return self.ms_per(sum(call.num_cars for call in self.calls))
 
     @property
     def ms_per_frame(self) -> float | None:
-        """Mean over the frames of all calls, or None where there was none."""
-        return self._ms_per(self.num_frames)
-
-    def _ms_per(self, number: int) -> float | None:
-        return 1000 * sum(call.refine_s for call in self.calls) / number if number else None
+        return self.ms_per(self.num_frames)
 
 
-def write_timings(path: Path, timings: RunTimings) -> None:
+def write_timings(out_dir: Path, timings: RunTimings) -> None:
     """Write `timings.json` (schema 1): a file of its own, so that every other file is the same in every run."""
     content = {
         "schema_version": TIMINGS_SCHEMA_VERSION,
@@ -96,7 +97,7 @@ def write_timings(path: Path, timings: RunTimings) -> None:
             for call in timings.calls
         ],
     }
-    write_json(path, content)
+    write_json(out_dir / TIMINGS, content)
 
 
 def device_name(device: torch.device) -> str:
@@ -133,9 +134,8 @@ def _wait_for(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def _larger(first: float | None, second: float | None) -> float | None:
-    known = [value for value in (first, second) if value is not None]
-    return max(known) if known else None
+def _larger(*sizes: float | None) -> float | None:
+    return max((size for size in sizes if size is not None), default=None)
 
 
 def _rounded(number: float | None) -> float | None:
@@ -165,7 +165,7 @@ class RunSummary:
     @property
     def exit_code(self) -> int:
         """0 when every frame is done, 1 when some failed."""
-        return 1 if self.failed else 0
+        return int(bool(self.failed))
 
 
 def count_statuses(frames: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
@@ -209,18 +209,13 @@ def find_warnings(frames: Mapping[str, Mapping[str, Any]], classes: Sequence[str
 
 def format_summary(summary: RunSummary) -> str:
     """What the program prints at the end of a run."""
-    done = len(summary.frames) - len(summary.failed)
+    done, timings = len(summary.frames) - len(summary.failed), summary.timings
     earlier = f", {len(summary.resumed)} of them in an earlier run" if summary.resumed else ""
     statuses = ", ".join(f"{name} {count}" for name, count in summary.statuses.items()) or "none"
     lines = [
         f"frames   {done} done{earlier}, {len(summary.failed)} failed",
         f"cars     {summary.num_cars}: {statuses}",
     ]
-    return "\n".join([*lines, *_timing_lines(summary.timings)])
-
-
-def _timing_lines(timings: RunTimings) -> list[str]:
-    lines = []
     if timings.ms_per_frame is not None:
         per_car = "" if timings.ms_per_car is None else f"{timings.ms_per_car:.0f} ms per car, "
         where = device_name(timings.device)
@@ -234,4 +229,4 @@ def _timing_lines(timings: RunTimings) -> list[str]:
     each = " a worker" if timings.workers > 1 else ""
     sizes = [f"{host:.0f} MB{each}"] if host is not None else []
     sizes += [f"{device:.0f} MB on the device"] if device is not None else []
-    return [*lines, f"memory   {', '.join(sizes)} at most"] if sizes else lines
+    return "\n".join([*lines, f"memory   {', '.join(sizes)} at most"] if sizes else lines)

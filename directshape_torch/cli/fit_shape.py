@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.batch.fit_shape import ShapeFit, fit_shape
-from directshape_torch.batch.scan_fits import fit_scan, write_scan_fit
+from directshape_torch.batch.scan_fits import fit_scan
 from directshape_torch.cli.options import add_layout_options
 from directshape_torch.errors import InputError
 from directshape_torch.files.atomic_files import write_bytes, write_npz, write_text
@@ -70,10 +70,8 @@ def _fit_scans(args: argparse.Namespace) -> int:
         raise InputError("--lidar", f"a scan of frame {dataset.frame_ids[0]} or another", f"none in {args.lidar}")
     fits = []
     for frame_id in scanned:
-        scan = fit_scan(dataset, frame_id, prior)
-        write_scan_fit(args.out, scan)
-        fits.append(scan.fit)
-        print(f"{frame_id}  {_summary([scan.fit])}", flush=True)
+        fits.append(fit_scan(dataset, frame_id, args.out, prior))
+        print(f"{frame_id}  {_summary(fits[-1:])}", flush=True)
     if len(scanned) < len(dataset.frame_ids):
         print(f"no scan of {len(dataset.frame_ids) - len(scanned)} frames in {args.lidar}")
     print(f"all     {_summary(fits)}\nresults {args.out}")

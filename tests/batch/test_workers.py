@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-import torch
 from helpers import quick_runs
 from helpers.faulty_refiners import DeadlyRefiner, HungryRefiner, QuickRefiner
 from helpers.kitti_folder import write_data_set
@@ -18,9 +17,11 @@ from directshape_torch.batch.frame_groups import FrameGroup, frame_groups
 from directshape_torch.batch.group_refinement import GroupReport
 from directshape_torch.batch.options import RunObserver
 from directshape_torch.batch.run_status import read_status
-from directshape_torch.batch.run_summary import RunTimings
-from directshape_torch.batch.workers import GroupDispatch, WorkerDiedError
+from directshape_torch.batch.workers import reports_of
 from directshape_torch.errors import DirectShapeError
+from directshape_torch.io.run_manifest import FrameEntry
+
+DONE: FrameEntry = {"state": "done"}
 
 
 class Imagined:
@@ -36,60 +37,52 @@ class Imagined:
         self.at_work.append(group)
         assert len(self.at_work) <= self.capacity
 
-    def next_reports(self) -> list[tuple[FrameGroup, GroupReport | WorkerDiedError]]:
+    def next_reports(self) -> list[tuple[FrameGroup, GroupReport | None]]:
         group = self.at_work.pop()
         times_before = self.calls.count(group.frame_ids)
         self.calls.append(group.frame_ids)
         if self.dies(group, times_before):
-            return [(group, WorkerDiedError("killed"))]
+            return [(group, None)]
         done = [frame_id for frame_id in group.frame_ids if frame_id in group.wanted]
         self.written += done
-        return [
-            (group, GroupReport({frame_id: {"state": "done"} for frame_id in done}, RunTimings(torch.device("cpu"))))
-        ]
-
-    def close(self) -> None:
-        pass
+        return [(group, GroupReport(dict.fromkeys(done, DONE)))]
 
 
-def nothing(_: Collection[str]) -> Collection[str]:
-    return ()
-
-
-def dispatch(workers: Imagined, size: int = 1, retries: int = 1, frames: str = "abcdefgh") -> GroupDispatch:
-    return GroupDispatch(frame_groups(frames, size, ()), workers, retries, nothing)
+def ends(
+    workers: Imagined, size: int = 1, retries: int = 1, frames: str = "abcdefgh", finished: Collection[str] = ()
+) -> dict[str, FrameEntry]:
+    """How all frames ended."""
+    reports = reports_of(
+        workers, frame_groups(frames, size, ()), retries, lambda frame_id: DONE if frame_id in finished else None
+    )
+    return {frame_id: entry for report in reports for frame_id, entry in report.ends.items()}
 
 
 @pytest.mark.parametrize("retries", [0, 1, 2])
 def test_the_frame_that_kills_is_found_among_its_companions(retries: int) -> None:
     workers = Imagined(2, lambda group, _: "c" in group.frame_ids)
-    run = dispatch(workers, size=4, retries=retries)
-    list(run.reports())
+    found = ends(workers, size=4, retries=retries)
     assert sorted(workers.written) == list("abdefgh")
-    assert list(run.lost) == ["c"]
-    assert run.lost["c"] == f"its worker died each of {retries + 1} times (killed)"
+    reason = f"its worker died each of {retries + 1} times (killed, out of memory or crashed)"
+    assert found == {**dict.fromkeys("abdefgh", DONE), "c": {"state": "failed", "reason": reason}}
     for group in (("a", "b", "c", "d"), ("c", "d"), ("c",)):
         assert workers.calls.count(group) == retries + 1
-    assert run.num_deaths == 3 * (retries + 1)
 
 
-def test_what_was_noted_before_the_death_is_not_written_again() -> None:
+def test_what_was_finished_before_the_death_is_not_written_again() -> None:
     workers = Imagined(1, lambda group, before: "a" in group.frame_ids and before == 0)
-    run = GroupDispatch(frame_groups("abc", 3, ()), workers, 1, {"a", "b"}.intersection)
-    list(run.reports())
+    assert ends(workers, 3, frames="abc", finished="ab") == dict.fromkeys("abc", DONE)
     # All three are in the call again, for the sake of the bytes of the third.
     assert workers.calls == [("a", "b", "c")] * 2
     assert workers.written == ["c"]
-    run = GroupDispatch(frame_groups("abc", 3, ()), Imagined(1, lambda *_: True), 1, lambda ids: ids)
-    assert list(run.reports()) == []
-    assert run.lost == {}
+    assert ends(Imagined(1, lambda *_: True), 3, frames="abc", finished="abc") == dict.fromkeys("abc", DONE)
 
 
 def test_workers_that_never_finish_anything_end_the_run() -> None:
-    run = dispatch(Imagined(1, lambda *_: True))
-    with pytest.raises(DirectShapeError, match=r"workers die before they finish any frame \(killed\)"):
-        list(run.reports())
-    assert run.num_deaths == 6
+    workers = Imagined(1, lambda *_: True)
+    with pytest.raises(DirectShapeError, match=r"workers die before they finish any frame \(killed"):
+        ends(workers)
+    assert len(workers.calls) == 6
 
 
 refine = partial(quick_runs.refine, meshes="ply")
