@@ -68,7 +68,9 @@ def test_every_relative_link_leads_to_a_heading_of_a_file() -> None:
 def test_every_figure_of_the_results_is_in_the_docs() -> None:
     table = README[README.index("## Results") : README.index("## Limits")]
     figures = re.findall(r"\b0\.\d{3}\b", table)
-    known = "".join((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("results.md", "your_rig.md"))
+    known = "".join(
+        (ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("results.md", "your_rig.md", "tracks.md")
+    )
 
     assert len(figures) == 16
     assert not [figure for figure in figures if figure not in known]
