@@ -138,7 +138,7 @@ def test_sums_are_those_of_single_residuals(bench_of: BenchOf, regime: str) -> N
 @torch.no_grad()
 def test_a_tracked_pixel_ends_on_the_surface(bench_of: BenchOf) -> None:
     """After a step of the car the depth is a Newton step nearer to the surface than the point it is taken from."""
-    bench = bench_of("typical")
+    bench = bench_of("typical", pixels=40)
     term, field = bench.stage.photometric, bench.sight.field
     assert term is not None
     step = torch.full((len(bench.state.code), bench.num_unknowns), 0.03, dtype=torch.float64)

@@ -20,7 +20,8 @@ from directshape_torch.rows import PointSamples
 from directshape_torch.shape.field import field_of
 from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.point_cloud import PointCloud
-from directshape_torch.terms.term import Linear
+from directshape_torch.terms.robust import RobustValue
+from directshape_torch.terms.term import Linear, part_of
 
 PRIOR = ellipsoid_prior()
 FRONT = torch.tensor([[HALF_AXES[0] + 0.2, CENTRE_OBJ[1], 0.0]], dtype=torch.float64)
@@ -51,6 +52,22 @@ def test_signs_by_hand() -> None:
 def test_gradient_to_the_points() -> None:
     points_cam = se3.transform(T_CAM_OBJ, FRONT + 0.3 * torch.randn(6, 3, dtype=torch.float64)).requires_grad_()
     assert torch.autograd.gradcheck(lambda x: _at(x).residual[:, :6], points_cam)
+
+
+class _Known(PointCloud):
+    """Points whose norm has a weight of its own for the Fisher matrix, as one of a user may."""
+
+    def norm(self, residual: Tensor) -> RobustValue:
+        return super().norm(residual)._replace(information_weight=3 + residual)
+
+
+def test_the_fisher_matrix_has_the_weight_that_the_norm_gives_it() -> None:
+    points = PointSamples(torch.zeros(5, dtype=torch.long), torch.randn(5, 3).double(), torch.tensor([5]))
+    term = _Known.of_points(PointCloudConfig(min_points=1), points)
+    state = CarState.of(T_CAM_OBJ, PRIOR.initial_code(1))
+    at = term.linear(field_of(PRIOR.bind(state.code)), state, ())
+    J, weight = at.J_inner_state[0, :5], 3 + at.residual[0, :5]
+    torch.testing.assert_close(part_of(term, at).information[0], J.mT @ (weight * J))
 
 
 def _of(config: PointCloudConfig, method: Literal["geometric", "combined"] = "combined") -> tuple[CarStage, CarState]:

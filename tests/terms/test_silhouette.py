@@ -16,7 +16,7 @@ from torch import Tensor
 
 from directshape_torch.geometry import se3
 from directshape_torch.rows import ObjectRays
-from directshape_torch.shape.field import PackedField
+from directshape_torch.shape.field import PackedField, field_of
 from directshape_torch.terms import silhouette
 from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.depth import closest_of_march, march
@@ -97,6 +97,17 @@ def test_a_ray_that_misses_the_bounds_counts_as_background(
     assert isinstance(term, (Silhouettes, SilhouetteProducts))
     torch.testing.assert_close(at.parts[0].residual[..., 0], -torch.log(1 - term.rows.foreground))
     assert (at.gradient[:, :2] == 0).all()
+
+
+def test_products_are_the_same_with_gradients_on() -> None:
+    """There the samples are made otherwise, for they move with the bounds."""
+    prior, scene = cached_street()
+    config = replace(DEFAULT, silhouette=replace(DEFAULT.silhouette, form="product"))
+    stage, state = begun_stage(prior, scene.frames, disturbed(scene.detections), config)
+    field, term = field_of(prior.bind(state.code)), stage.terms[0]
+    differentiable = term.linear(field, state, ())
+    with torch.no_grad():
+        torch.testing.assert_close(differentiable, term.linear(field, state, ()))
 
 
 def test_zeta_comes_from_the_input_depth_and_not_from_the_state() -> None:
