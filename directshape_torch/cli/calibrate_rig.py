@@ -17,12 +17,14 @@ from directshape_torch.cli.options import add_data_options, dataset_of
 from directshape_torch.cli.progress import Bar
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import write_png
+from directshape_torch.io.frame_layout import frames_among
+from directshape_torch.io.layouts import object_layout
 from directshape_torch.rig.estimate import RigEstimate, rig_among
 from directshape_torch.rig.from_files import (
     TruthSource,
     add_truth,
-    chosen_frames,
     estimate_rigs,
+    gaps,
     observe_frame,
     observe_motion,
     open_sequence,
@@ -75,11 +77,11 @@ def run(args: argparse.Namespace) -> int:
 
 def _add_truth(args: argparse.Namespace, source: TruthSource, rigs: list[RigEstimate]) -> None:
     """Every frame that can be read; one that cannot is reported and left out."""
-    files, frames = truth_files(args.data, source), []
-    names = chosen_frames(list(files), args.frames)
+    layout, truth, frames = object_layout(args.data, args.data), truth_files(args.data, source), []
+    names = list(truth) if args.frames is None else frames_among(list(truth), args.frames, f"ids with {source}")
     for frame_id in Bar(names, desc=source, unit="frame", disable=None):
         try:
-            frames.append(observe_frame(args.data, frame_id, files[frame_id], source))
+            frames.append(observe_frame(layout.files(frame_id), truth[frame_id], source))
         except DataFormatError as error:
             print(f"frame {frame_id} left out: {error}", file=sys.stderr)
     add_truth(rigs, source, frames)
@@ -89,12 +91,12 @@ def _add_motion(args: argparse.Namespace, rigs: list[RigEstimate]) -> None:
     if not 0 <= args.camera_height < 10:
         raise InputError("--camera-height", "metres between 0 (not known) and 10", str(args.camera_height))
     sequence = open_sequence(args.data, args.frames)
-    for before, after in sequence.gaps():
+    for before, after in gaps(list(sequence)):
         print(f"warning: frames {before} and {after} are not consecutive: few points are found again", file=sys.stderr)
-    shown = Bar(sequence.frame_ids, desc="motion", unit="frame", disable=None)
-    constraints = observe_motion(sequence, args.camera_height or None, shown)
+    shown = Bar(sequence.values(), desc="motion", unit="frame", disable=None)
+    constraints = observe_motion(shown, args.camera_height or None)
     with Bar(desc="fit to all frames, then to halves", unit="step", disable=None) as bar:
-        found = self_calibrate(constraints, len(sequence.frame_ids), bar.update)
+        found = self_calibrate(constraints, len(sequence), bar.update)
     if not found.converged:
         print("warning: the fit was still moving when it was ended", file=sys.stderr)
     rig_among(rigs, constraints[0].rig).add_pixels("motion", found.evidence)

@@ -65,7 +65,7 @@ def _fit_scans(args: argparse.Namespace) -> int:
         raise InputError("--data", "the folder of the data set that the scans belong to", "none", "--data ROOT")
     options = {"frames": args.frames, "classes": args.classes, "lidar_dir": args.lidar}
     dataset, prior = open_dataset(args.layout, args.data, args.boxes, **options), load_prior(args.prior)
-    scanned = [each for each in dataset.frame_ids if dataset.layout.lidar_files(args.lidar, each)["lidar"].is_file()]
+    scanned = [each for each in dataset.frame_ids if dataset.input_files(each)["lidar"].is_file()]
     if not scanned:
         raise InputError("--lidar", f"a scan of frame {dataset.frame_ids[0]} or another", f"none in {args.lidar}")
     fits = []

@@ -101,8 +101,8 @@ def _files(dataset: StereoDataset, frame_id: str) -> Iterable[tuple[str, Path]]:
         return [(role.rstrip("_0123456789"), path) for role, path in dataset.input_files(frame_id).items()]
     except DataFormatError as error:
         # A file that names others is itself missing, or damaged: then that is found when the frame is read.
-        left, right = dataset.layout.images(frame_id)
-        return [("image_left", left), ("image_right", right), ("list of masks", error.path)]
+        files = dataset.layout.files(frame_id)
+        return [("image_left", files.left), ("image_right", files.right), ("list of masks", error.path)]
 
 
 def _missing(role: str, paths: list[str], num_frames: int) -> Finding:

@@ -56,10 +56,9 @@ def read_parts(dataset: StereoDataset, frame_id: str) -> tuple[FrameParts, list[
                 findings.append(found)
             return None
 
-    layout = dataset.layout
-    left_path, right_path = layout.images(frame_id)
-    left = attempt("left_image", "a whole PNG or JPEG", lambda: read_rgb(left_path))
-    right = attempt("right_image", "a whole PNG or JPEG", lambda: read_rgb(right_path))
+    files = dataset.layout.files(frame_id)
+    left = attempt("left_image", "a whole PNG or JPEG", lambda: read_rgb(files.left))
+    right = attempt("right_image", "a whole PNG or JPEG", lambda: read_rgb(files.right))
     if left is not None and right is not None and left.shape != right.shape:
         findings.append(_other_size(frame_id, left.shape, right.shape))
         left = None
@@ -67,7 +66,7 @@ def read_parts(dataset: StereoDataset, frame_id: str) -> tuple[FrameParts, list[
     calibration = attempt(
         "calibration_file",
         "P2 and P3, 12 finite numbers each, or rig.json as in docs/inputs.md",
-        lambda: layout.calibration(frame_id),
+        files.read_calibration,
     )
     if pair is not None and calibration is not None:
         try:
@@ -75,16 +74,12 @@ def read_parts(dataset: StereoDataset, frame_id: str) -> tuple[FrameParts, list[
         except DataFormatError as error:
             findings.append(_unreadable("image_size", frame_id, "the size that the calibration is of", error))
             pair = None  # what rests on both would only say the same again
-    objects = attempt(
-        "detection_file", "lines of 15 or 16 columns, or JSON as in docs/inputs.md", lambda: dataset.objects(frame_id)
-    )
+    objects = attempt("detection_file", "lines of 15 or 16 columns, or JSON as in docs/inputs.md", files.read_objects)
     masks = None
     if dataset.masks is not None and pair is not None:
         source, size_hw = dataset.masks, (pair[0].shape[0], pair[0].shape[1])
         masks = attempt("mask_file", "masks of both images", lambda: source.read(frame_id, size_hw))
-    plane = "a x + b y + c z + d = 0 with |b| near 1"
-    if attempt("plane_file", plane, lambda: layout.plane_path(frame_id)) is not None:
-        attempt("plane_file", plane, lambda: layout.plane_ref(frame_id))
+    attempt("plane_file", "a x + b y + c z + d = 0 with |b| near 1", files.read_plane)
     refined = [o for o in objects or [] if o.type in dataset.classes and o.has_box_3d]
     parts = FrameParts(frame_id, pair, calibration, _camera(calibration), refined, masks)
     return parts, findings

@@ -14,7 +14,7 @@ from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.bootstrap import BootstrapSettings, CarBootstrap, Estimate, MetricSummary, Statistic
 from directshape_torch.evaluation.matching import CountedLabels, files_of_frames, match_to_labels, named_frames
 from directshape_torch.evaluation.pose_error import CarErrors, errors_of
-from directshape_torch.io.kitti_labels import FrameObjects, KittiObject
+from directshape_torch.io.kitti_labels import KittiObject, objects_in, objects_path
 from directshape_torch.io.result_files import read_shapes
 
 WORSE_BY_BEV_IOU = 0.05
@@ -117,9 +117,8 @@ def compare_results(
         raise InputError("frames", f"at least one frame; result files NNNNNN.txt in {before_dir}", "none")
     pairs: list[_Pair] = []
     num_counted = num_found = 0
-    objects = FrameObjects()
     for frame_id in frame_ids:
-        found, count = _pairs_of_frame(objects, sources, frame_id, counted)
+        found, count = _pairs_of_frame(sources, frame_id, counted)
         num_found += len(found)
         num_counted += count
         pairs += found if shapes_dir is None else _with_left_mask(found, Path(shapes_dir) / f"{frame_id}.npz")
@@ -174,16 +173,14 @@ def _frames_of(before: Path, after: Path) -> tuple[str, ...]:
     return tuple(frame for stem in files_of_frames(before) for frame in of_sequence.get(stem, [stem]))
 
 
-def _pairs_of_frame(
-    objects: FrameObjects, sources: tuple[Path, Path, Path], frame_id: str, counted: CountedLabels
-) -> tuple[list[_Pair], int]:
+def _pairs_of_frame(sources: tuple[Path, Path, Path], frame_id: str, counted: CountedLabels) -> tuple[list[_Pair], int]:
     """Counted labels of a frame that have a detection, and the number of those that count at all."""
-    label_path, before_path, after_path = (objects.path(source, frame_id) for source in sources)
-    labels = objects.read(label_path, frame_id)
+    label_path, before_path, after_path = (objects_path(source, frame_id) for source in sources)
+    labels = objects_in(label_path, frame_id)
     if not after_path.is_file():
         cure = "was it refined? name the frames that were with --frames or --split"
         raise DataFormatError(after_path, f"there is no result of frame {frame_id}", cure=cure)
-    before, after = objects.read(before_path, frame_id), objects.read(after_path, frame_id)
+    before, after = objects_in(before_path, frame_id), objects_in(after_path, frame_id)
     _check_same_lines(before_path, before, after_path, after)
     lines = [pair for pair in zip(before, after, strict=True) if pair[0].type in counted.types and pair[0].has_box_3d]
     partners = match_to_labels([old for old, _ in lines], labels)

@@ -79,7 +79,7 @@ def frame_glb(painted: PaintedFrame, loaded: LoadedFrame | None) -> bytes:
 def _time_s(source: FrameSource) -> float:
     """When the frame was taken, NaN where nobody knows."""
     dataset = source.inputs.dataset
-    time_s = None if dataset is None else dataset.layout.motion(source.frame_id)[0]
+    time_s = None if dataset is None else dataset.layout.files(source.frame_id).read_motion()[0]
     return np.nan if time_s is None else time_s
 
 

@@ -12,10 +12,11 @@ import math
 import os
 import stat
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache, wraps
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,7 @@ _ENCRYPTED = 1
 _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 # What is left of the 255 that file systems take belongs to endings and to the names of temporary files.
 _MOST_NAME_BYTES = 200
+_T = TypeVar("_T")
 
 
 def is_frame_id(frame_id: object) -> bool:
@@ -93,6 +95,26 @@ def read_text(path: Path | str, most: int = _MOST_TEXT_BYTES, cure: str = "check
         return read_bytes(path, most, cure).decode("utf-8")
     except UnicodeDecodeError as error:
         raise DataFormatError(path, f"is not UTF-8 text ({error.reason} at byte {error.start})") from error
+
+
+def remembered(read: Callable[[Path], _T]) -> Callable[[Path | str], _T]:
+    """What `read` makes of a file, kept while its size and time of change stay the same: for files that serve many
+    frames. Whoever gets it leaves it as it is."""
+
+    # With the state of the file, which is looked at only as a key.
+    @lru_cache(maxsize=256)
+    def in_state(path: Path, _size_bytes: int, _changed_ns: int) -> _T:
+        return read(path)
+
+    @wraps(read)
+    def of_path(path: Path | str) -> _T:
+        path = Path(path)
+        if not path.is_file():
+            return read(path)
+        state = path.stat()
+        return in_state(path, state.st_size, state.st_mtime_ns)
+
+    return of_path
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,6 @@ from directshape_torch.scene import Detections, Occluders
 MIN_OVERLAP = 0.3
 # Two masks of one image that share more than this are the same object seen twice by the segmentation.
 DUPLICATE_MASK_IOU = 0.5
-# For each input line the instance that its file gives it in either image, -1 for none.
-GivenMasks = Mapping[Side, Sequence[int]]
 # The mask of each of B objects.
 _Found = list[InstanceMask | None]
 
@@ -34,25 +32,21 @@ def build_detections(
     camera: StereoCamera,  # of one frame
     size_hw: tuple[int, int],
     classes: Collection[str],
-    given: GivenMasks | None = None,
 ) -> tuple[Detections, tuple[int, ...], tuple[int, ...]]:
     """The objects to refine, with masks matched one to one; all other instances become occluders.
 
-    Masks belong to lines as `given` says, else by overlap. Returns the B detections; for each input line the index of
-    its detection or -1; the tracks (B,) of the left masks, -1 for none.
+    Masks belong to lines as they say themselves, else by overlap. Returns the B detections; for each input line the
+    index of its detection or -1; the tracks (B,) of the left masks, -1 for none.
     """
     is_chosen = [o.type in classes and o.has_box_3d for o in objects]
     chosen = [o for o, wanted in zip(objects, is_chosen, strict=True) if wanted]
     others = [o for o in objects if o.type not in classes and o.has_box_3d]
-    if given is None:
-        found = _match([mask for mask in masks if mask.is_car], chosen, camera, size_hw)
+    of_row = {(mask.side, mask.row): mask for mask in masks if mask.row is not None}
+    if of_row:
+        rows_of = [row for row, wanted in enumerate(is_chosen) if wanted]
+        found: dict[Side, _Found] = {side: [of_row.get((side, row)) for row in rows_of] for side in SIDES}
     else:
-        # An instance whose mask is empty is none.
-        by_id = {(mask.side, mask.instance_id): mask for mask in masks}
-        found = {
-            side: [by_id.get((side, n)) for n, wanted in zip(given[side], is_chosen, strict=True) if wanted]
-            for side in SIDES
-        }
+        found = _match([mask for mask in masks if mask.is_car], chosen, camera, size_hw)
     dtype = camera.K_left.dtype
     detections = Detections(
         frame_index=torch.zeros(len(chosen), dtype=torch.int64),

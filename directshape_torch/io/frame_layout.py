@@ -1,97 +1,149 @@
-"""Where the parts of a frame are: the only thing in which the layouts of stereo data sets differ."""
+"""Where the parts of a frame are, all in which the layouts of stereo data sets differ, and what these files say."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.errors import DataFormatError
-from directshape_torch.io.frame_detections import GivenMasks
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.io import folder_files
 from directshape_torch.io.image_files import IMAGE_ENDINGS
-from directshape_torch.io.instance_masks import MaskSource
-from directshape_torch.io.kitti_calibration import KittiCalibration
-from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.io.mask_files import mask_source
+from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration, read_plane, read_velo_to_cam
+from directshape_torch.io.kitti_labels import KittiObject, frame_number, objects_in, read_objects
+from directshape_torch.io.motion_files import of_line, read_poses, read_times
 
 
-class FrameLayout(ABC):
-    """Finds and reads the files of a frame, all but images and masks, whose readers the layouts share."""
+@dataclass(frozen=True)
+class FrameFiles:
+    """The files of one frame; all but the images are KITTI's, or where they end in .json those of the plain folder,
+    whose file of detections holds plane, labels, time and camera pose too.
+    """
 
-    detections_dir: Path
-    detection_file_name: str
+    left: Path
+    right: Path
+    calibration: Path
+    detections: Path
+    # What a frame may be called in a folder that somebody names: "000012", of several sequences "0005/000012" or
+    # "0005_000012".
+    names: tuple[str, ...]
+    plane: Path  # where it would be
+    # The sequence of frames that follow each other, "" where there is but one; None: a frame by itself.
+    sequence: str | None = None
+    labels: Path | None = None
+    velo_to_cam: Path | None = None  # places the LiDAR; None: the calibration does
+    # Times and camera poses of a sequence, a line each from frame 0 on.
+    times: Path | None = None
+    trajectory: Path | None = None
 
-    @abstractmethod
+    @property
+    def stems(self) -> tuple[str, ...]:
+        """`names` without folders."""
+        return tuple(Path(name).name for name in self.names)
+
+    def read_calibration(self) -> KittiCalibration:
+        """The rig."""
+        is_folder = _is_json(self.calibration)
+        return folder_files.calibration_of(self.calibration) if is_folder else read_calibration(self.calibration)
+
+    def read_lidar_calibration(self) -> KittiCalibration:
+        """The rig with the place of the LiDAR, where its format can say that."""
+        calibration, place = self.read_calibration(), self.velo_to_cam
+        return calibration if place is None else replace(calibration, Tr_velo_to_cam=read_velo_to_cam(place))
+
+    def read_objects(self) -> list[KittiObject]:
+        """The detections."""
+        if _is_json(self.detections):
+            return folder_files.detections_of(self.detections, self.calibration)
+        return objects_in(self.detections, *self.stems)
+
+    def read_labels(self) -> list[KittiObject] | None:
+        """The ground truth, or None."""
+        if _is_json(self.detections):
+            return folder_files.labels_of(self.detections, self.calibration)
+        if self.labels is None or not self.labels.is_file():
+            return None
+        of_frame = self.labels.stem in self.stems
+        return read_objects(self.labels, with_score=False) if of_frame else objects_in(self.labels, *self.stems)
+
+    def read_plane(self, needed: bool = False) -> NDArray[np.float64] | None:
+        """The ground plane (a, b, c, d), see `kitti_calibration.read_plane`; None where there is none and none is
+        needed."""
+        if _is_json(self.detections):
+            return folder_files.plane_of(self.detections, needed)
+        return read_plane(self.plane) if needed or self.plane.is_file() else None
+
+    def read_motion(self) -> tuple[float | None, NDArray[np.float64] | None]:
+        """When the frame was taken, seconds, and T_world_ref (4, 4); None where that is not known."""
+        if _is_json(self.detections):
+            return folder_files.motion_of(self.detections)
+        said = [
+            None if path is None else of_line(path, read(path), frame_number(self.stems[0]))
+            for path, read in ((self.times, read_times), (self.trajectory, read_poses))
+        ]
+        return None if said[0] is None else float(said[0]), said[1]
+
+    def within(self, folder: Path, *endings: str) -> Path:
+        """The file of the frame in a folder, or in a folder `data` there, else where it would be.
+
+        Endings such as ".png", the most wanted first.
+        """
+        return first_existing([*candidates(folder, self.names, endings), folder / f"{self.names[0]}{endings[-1]}"])
+
+
+class FrameLayout(Protocol):
+    """A data set, by the files of its frames."""
+
+    detections_dir: Path  # where they are looked for
+    detection_file_name: str  # for messages, such as "NNNNNN.txt"
+
     def frame_ids(self) -> list[str]:
         """All frames that have detections, sorted."""
 
-    @abstractmethod
-    def frame_id(self, number: int) -> str:
-        """The name of the frame of that number."""
+    def files(self, frame_id: str) -> FrameFiles:
+        """The files of a frame."""
 
-    @abstractmethod
-    def images(self, frame_id: str) -> tuple[Path, Path]:
-        """Left and right image."""
 
-    @abstractmethod
-    def calibration_path(self, frame_id: str) -> Path: ...
+def candidates(folder: Path, names: Sequence[str], endings: Sequence[str]) -> list[Path]:
+    """Where the file of a frame of several names may be."""
+    files = [folder / f"{name}{ending}" for name in names for ending in endings]
+    return [place for file in files for place in (file.parent / "data" / file.name, file)]
 
-    @abstractmethod
-    def calibration(self, frame_id: str) -> KittiCalibration: ...
 
-    @abstractmethod
-    def plane_path(self, frame_id: str) -> Path | None:
-        """The file with the ground plane of a frame, or None where it has none."""
+def first_existing(paths: Sequence[Path]) -> Path:
+    """The first file that exists, else the last of all."""
+    return next((path for path in paths if path.is_file()), paths[-1])
 
-    @abstractmethod
-    def plane_ref(self, frame_id: str) -> NDArray[np.float64]:
-        """The plane (a, b, c, d) of that file, see `read_plane`."""
 
-    @abstractmethod
-    def detection_path(self, frame_id: str) -> Path: ...
+def frames_among(known: Sequence[str], wanted: Iterable[str | int], expected: str) -> list[str]:
+    """Those of the known frames that are meant by ids, or by numbers with leading zeros or without, each once.
 
-    @abstractmethod
-    def objects(self, frame_id: str) -> list[KittiObject]:
-        """The detections of a frame."""
+    A number may leave out what all of them end in: 7 is `000007_10`, the first pair of a scene of KITTI Stereo 2015.
 
-    @abstractmethod
-    def labels(self, frame_id: str) -> list[KittiObject] | None:
-        """The ground truth of a frame, or None."""
+    Raises:
+        InputError: unknown ones; in the words for what was expected.
 
-    def disparity_path(self, folder: Path, frame_id: str) -> Path:
-        """The disparity map of a frame in a folder of such maps."""
-        return first_disparity(folder, frame_id)
+    Examples:
+        >>> frames_among(["000007", "000012"], [12, "7"], "frames of a run")
+        ['000012', '000007']
+    """
+    of_number = {_number(name.removesuffix("_10")): name for name in reversed(known)}
+    # The ids after the numbers, so that they win.
+    found = of_number | {name: name for name in known}
+    words = {word: word if word in found else _number(word) for word in map(str, wanted)}
+    if missing := [word for word, key in words.items() if key not in found]:
+        example = f", such as {known[0]}" if known else ""
+        raise InputError("frames", f"{expected}{example}", ", ".join(missing[:5]), "check the choice of frames")
+    return list(dict.fromkeys(found[key] for key in words.values()))
 
-    def lidar_files(self, folder: Path, frame_id: str) -> dict[str, Path]:
-        """By role: the scan of a frame in a folder of scans ("lidar"), and a file of the scanner's place."""
-        return {"lidar": folder / f"{frame_id}.bin"}
 
-    def lidar_calibration(self, frame_id: str) -> KittiCalibration:
-        """The calibration that places the scanner in the camera, where its format can."""
-        return self.calibration(frame_id)
-
-    def sequence_of(self, frame_id: str) -> str | None:
-        """The sequence of frames that follow each other, "" where there is but one; None: a frame by itself."""
-        return None
-
-    def motion_files(self, frame_id: str) -> dict[str, Path]:
-        """The files of times and camera poses that there are for a frame, by role."""
-        return {}
-
-    def motion(self, frame_id: str) -> tuple[float | None, NDArray[np.float64] | None]:
-        """When a frame of a sequence was taken, seconds, and T_world_ref (4, 4); None where that is not known."""
-        return None, None
-
-    def masks(self, directory: Path | None) -> MaskSource | None:
-        """The reader of a folder of masks; None: of those that come with the layout itself, if there are any."""
-        return None if directory is None else mask_source(directory)
-
-    def given_masks(self, frame_id: str) -> GivenMasks | None:
-        """Which instance belongs to which detection where the layout's own masks say so; None: matched by overlap."""
-        return None
+def _number(word: str) -> str:
+    """A number without leading zeros; other names as they are."""
+    return word.lstrip("0") or "0" if word.isdecimal() else word
 
 
 def existing_folder(path: Path, problem: str, cure: str = "check the path") -> Path:
@@ -101,17 +153,10 @@ def existing_folder(path: Path, problem: str, cure: str = "check the path") -> P
     return path
 
 
-def first_existing(paths: Sequence[Path]) -> Path:
-    """The first file that exists, else the first of all."""
-    return next((path for path in paths if path.is_file()), paths[0])
-
-
 def image_stems(folder: Path) -> list[str]:
     """Names without ending of the images in a folder, sorted."""
     return sorted({path.stem for path in folder.glob("*") if path.suffix.lstrip(".") in IMAGE_ENDINGS})
 
 
-def first_disparity(folder: Path, stem: str) -> Path:
-    """`NNNNNN_10.png`, as submissions to KITTI Stereo 2015 call the first pair of a scene, else `NNNNNN.png`."""
-    first_pair = folder / f"{stem}_10.png"
-    return first_pair if first_pair.is_file() else folder / f"{stem}.png"
+def _is_json(path: Path) -> bool:
+    return path.suffix == ".json"

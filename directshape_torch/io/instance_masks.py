@@ -42,6 +42,8 @@ class InstanceMask:
     score: float  # the segmentation's, 1 where there is none
     # Number of the car over the frames of its sequence, -1 where `instance_id` is of one frame alone.
     track_id: int = -1
+    # The detection that the file gives it to, counted from 0; None: found by overlap.
+    row: int | None = None
 
 
 def instance_of(
@@ -50,15 +52,18 @@ def instance_of(
     probability: NDArray[np.bool_] | NDArray[np.float32],
     *,
     is_car: bool,
-    box: tuple[float, float, float, float] | None = None,
+    box: Sequence[float] | None = None,
     score: float = 1.0,
     track_id: int = -1,
+    row: int | None = None,
 ) -> InstanceMask | None:
     """An instance, whose box is that of its mask where the file has none; None without a pixel above one half."""
     mask_box = tight_box(probability)
     if mask_box is None:  # an empty mask says nothing about a car
         return None
-    return InstanceMask(side, instance_id, is_car, box or mask_box, mask_box, probability, score, track_id)
+    u_min, v_min, u_max, v_max = box or mask_box
+    own = (u_min, v_min, u_max, v_max)
+    return InstanceMask(side, instance_id, is_car, own, mask_box, probability, score, track_id, row)
 
 
 class MaskSource(Protocol):

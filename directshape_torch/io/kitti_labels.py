@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.files.read_files import Line, read_lines
+from directshape_torch.files.read_files import Line, read_lines, remembered
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.instance_masks import file_of_frame
 
@@ -120,6 +120,7 @@ def box_corners_cam(
     return box_corners(poses_cam(objects, t_cam_ref.double()), dimensions_hwl)
 
 
+@remembered
 def read_tracking_objects(path: Path | str) -> dict[int, list[KittiObject]]:
     """The objects of every frame number that occurs in a label (17 columns) or result file (18), with their tracks.
 
@@ -138,31 +139,19 @@ def read_tracking_objects(path: Path | str) -> dict[int, list[KittiObject]]:
     return frames
 
 
-class FrameObjects:
-    """Objects frame by frame, of files of frames or of the tracking benchmark, each of which is read once."""
+def objects_path(source: Path, frame_id: str) -> Path:
+    """The file of a frame `FRAME` or `SEQUENCE_NNNNNN`.
 
-    def __init__(self) -> None:
-        self._sequences: dict[Path, dict[int, list[KittiObject]]] = {}
+    `source` is a folder of `FRAME.txt` or `SEQUENCE.txt`, or one with `data` of them, or the file of a sequence.
+    """
+    of_frame, sequence = file_of_frame(source, f"{frame_id}.txt"), frame_id.rpartition("_")[0]
+    of_sequence = source if source.is_file() else file_of_frame(source, f"{sequence}.txt")
+    return of_sequence if not of_frame.is_file() and of_sequence.is_file() else of_frame
 
-    def path(self, source: Path, frame_id: str) -> Path:
-        """The file of a frame `FRAME` or `SEQUENCE_NNNNNN`.
 
-        `source` is a folder of `FRAME.txt` or `SEQUENCE.txt`, or one with `data` of them, or the file of a sequence.
-        """
-        of_frame, sequence = file_of_frame(source, f"{frame_id}.txt"), frame_id.rpartition("_")[0]
-        of_sequence = source if source.is_file() else file_of_frame(source, f"{sequence}.txt")
-        return of_sequence if not of_frame.is_file() and of_sequence.is_file() else of_frame
-
-    def read(self, path: Path, frame_id: str) -> list[KittiObject]:
-        """The objects of a frame in a file that `path` named; raises as `of_sequence`."""
-        return read_objects(path) if path.stem == frame_id else self.of_sequence(path, frame_id)
-
-    def of_sequence(self, path: Path, frame_id: str) -> list[KittiObject]:
-        """The objects of a frame in a file of the tracking benchmark."""
-        number = frame_number(frame_id)
-        if path not in self._sequences:
-            self._sequences[path] = read_tracking_objects(path)
-        return self._sequences[path].get(number, [])
+def objects_in(path: Path, *names: str) -> list[KittiObject]:
+    """The objects of a frame in a file that is called as the frame, else in one of the tracking benchmark."""
+    return read_objects(path) if path.stem in names else read_tracking_objects(path).get(frame_number(names[0]), [])
 
 
 def frame_number(frame_id: str) -> int:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError, shown
-from directshape_torch.files.read_files import read_json
+from directshape_torch.files.read_files import read_json, remembered
+from directshape_torch.io import folder_files
+from directshape_torch.io.frame_layout import FrameLayout
 from directshape_torch.io.image_files import find_image, read_single_channel
 from directshape_torch.io.instance_masks import (
     SIDES,
@@ -32,6 +34,8 @@ PNG_CAR_IDS = frozenset({1, 26})
 _MOTS_IGNORE_CLASS = 10
 _IDS_PER_CLASS = 1000
 _TRACKING_FOLDERS = ("instance_02", "instance_03")
+# With its place in its file.
+_Entry = tuple[int, Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -47,14 +51,7 @@ class FrameJsonMasks:
 
     def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
         path = self.path(frame_id)
-        masks, entries = [], read_coco_list(path)
-        check_count(path, len(entries), size_hw)
-        for index, entry in enumerate(entries):
-            side = entry.get("image")
-            if side not in SIDES:
-                raise DataFormatError(path, f"entry {index}: 'image' is {shown(side)}, expected 'left' or 'right'")
-            masks.append(_from_coco(path, index, entry, side, size_hw, self.car_ids))
-        return [mask for mask in masks if mask is not None]
+        return _from_coco(path, list(enumerate(read_coco_list(path))), size_hw, self.car_ids)
 
     def files(self, frame_id: str) -> tuple[Path, ...]:
         path = self.path(frame_id)
@@ -117,42 +114,55 @@ class CocoFileMasks:
     left: Path | None
     right: Path | None
     car_ids: frozenset[int] = COCO_CAR_IDS  # category ids that are cars
-    _by_frame: dict[Side, dict[int, list[tuple[int, Mapping[str, Any]]]]] = field(
-        default_factory=dict, init=False, repr=False, compare=False
-    )
 
     def __post_init__(self) -> None:
         if self.left is None and self.right is None:
             raise InputError("left, right", "at least one COCO result file", "none")
 
     def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
+        # `int` would take 000046_10 for 4610.
+        if not frame_id.isdecimal():
+            raise InputError("frame_id", "a number, as COCO's image_id is one", repr(frame_id), "give one file a frame")
         masks = []
         for side, path in zip(SIDES, (self.left, self.right), strict=True):
             if path is not None:
-                entries = self._entries(side, path).get(_frame_number(frame_id), [])
-                check_count(path, len(entries), size_hw)
-                for index, entry in entries:
-                    masks.append(_from_coco(path, index, entry, side, size_hw, self.car_ids))
-        return [mask for mask in masks if mask is not None]
+                entries = _coco_by_frame(path).get(int(frame_id), [])
+                masks += _from_coco(path, entries, size_hw, self.car_ids, side)
+        return masks
 
     def files(self, frame_id: str) -> tuple[Path, ...]:  # the same two files serve all frames
         return tuple(path for path in (self.left, self.right) if path is not None)
 
-    def _entries(self, side: Side, path: Path) -> dict[int, list[tuple[int, Mapping[str, Any]]]]:
-        """The entries of a file by frame; such files hold a whole data set, so each is read once."""
-        if side not in self._by_frame:
-            frames: dict[int, list[tuple[int, Mapping[str, Any]]]] = {}
-            for index, entry in enumerate(read_coco_list(path)):
-                try:
-                    number = int(entry["image_id"])
-                except (KeyError, TypeError, ValueError) as error:
-                    raise DataFormatError(
-                        path,
-                        f"entry {index}: 'image_id' is {shown(entry.get('image_id'))}, expected the frame's number",
-                    ) from error
-                frames.setdefault(number, []).append((index, entry))
-            self._by_frame[side] = frames
-        return self._by_frame[side]
+
+@dataclass(frozen=True)
+class LayoutMasks:
+    """Masks of the frames of a layout: in one folder (see `mask_source`), or of several sequences in one for each;
+    without a folder those of a plain folder's own files."""
+
+    layout: FrameLayout
+    directory: Path | None
+
+    def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
+        files = self.layout.files(frame_id)
+        if self.directory is None:
+            return folder_files.masks_of(files.detections, files.calibration.parent, size_hw)
+        source, name = _of_frame(self.directory, files.names)
+        return source.read(name, size_hw)
+
+    def files(self, frame_id: str) -> tuple[Path, ...]:
+        files = self.layout.files(frame_id)
+        if self.directory is None:
+            return folder_files.mask_files(files.detections, files.calibration.parent)
+        source, name = _of_frame(self.directory, files.names)
+        return source.files(name)
+
+
+def _of_frame(directory: Path, names: Sequence[str]) -> tuple[FrameJsonMasks | InstancePngMasks, str]:
+    """The masks of a frame's sequence, and what it is called there."""
+    places = [directory / name for name in names if (directory / name).parent.is_dir()]
+    source = mask_source(places[0].parent)
+    stems = [place.name for place in places if place.parent == places[0].parent]
+    return source, next((stem for stem in stems if source.path(stem).is_file()), stems[0])
 
 
 def mask_source(directory: Path | str) -> FrameJsonMasks | InstancePngMasks:
@@ -178,32 +188,45 @@ def read_coco_list(path: Path) -> list[Mapping[str, Any]]:
     return entries
 
 
+@remembered
+def _coco_by_frame(path: Path) -> dict[int, list[_Entry]]:
+    """The entries of a file by frame; such files hold a whole data set."""
+    frames: dict[int, list[_Entry]] = {}
+    for index, entry in enumerate(read_coco_list(path)):
+        try:
+            frames.setdefault(int(entry["image_id"]), []).append((index, entry))
+        except (KeyError, TypeError, ValueError) as error:
+            problem = f"entry {index}: 'image_id' is {shown(entry.get('image_id'))}, expected the frame's number"
+            raise DataFormatError(path, problem) from error
+    return frames
+
+
 def _from_coco(
     path: Path,
-    index: int,
-    entry: Mapping[str, Any],
-    side: Side,
+    entries: Sequence[_Entry],
     size_hw: tuple[int, int],
     car_ids: frozenset[int],
-) -> InstanceMask | None:
-    soft = entry.get("soft_probability")
-    if soft:
-        probability: Any = read_soft_mask(path.parent / str(soft), size_hw)
-    else:
-        probability = decode_segmentation(path, f"entry {index}", entry.get("segmentation"), size_hw)
-    if tight_box(probability) is None:  # whatever else its entry says
-        return None
-    try:
-        return instance_of(
-            side,
-            int(entry.get("instance_id", index)),
-            probability,
-            is_car=int(entry["category_id"]) in car_ids,
-            box=_file_box(entry),
-            score=_finite(entry.get("score", 1.0)),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataFormatError(path, f"entry {index}: bad or missing field ({error!r})") from error
+    of_side: Side | None = None,  # None: each says of which it is
+) -> list[InstanceMask]:
+    check_count(path, len(entries), size_hw)
+    masks = []
+    for index, entry in entries:
+        side = of_side or entry.get("image")
+        if side not in SIDES:
+            raise DataFormatError(path, f"entry {index}: 'image' is {shown(side)}, expected 'left' or 'right'")
+        if soft := entry.get("soft_probability"):
+            probability: Any = read_soft_mask(path.parent / str(soft), size_hw)
+        else:
+            probability = decode_segmentation(path, f"entry {index}", entry.get("segmentation"), size_hw)
+        if tight_box(probability) is None:  # whatever else its entry says
+            continue
+        try:
+            number, score = int(entry.get("instance_id", index)), _finite(entry.get("score", 1.0))
+            is_car, box = int(entry["category_id"]) in car_ids, _file_box(entry)
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataFormatError(path, f"entry {index}: bad or missing field ({error!r})") from error
+        masks.append(instance_of(side, number, probability, is_car=is_car, box=box, score=score))
+    return [mask for mask in masks if mask is not None]
 
 
 def _finite(value: Any) -> float:
@@ -219,10 +242,3 @@ def _file_box(entry: Mapping[str, Any]) -> tuple[float, float, float, float] | N
         return None
     x, y, width, height = (_finite(value) for value in entry["bbox"])
     return x, y, x + width - 1, y + height - 1
-
-
-def _frame_number(frame_id: str) -> int:
-    # `int` would take 000046_10 for 4610.
-    if not frame_id.isdecimal():
-        raise InputError("frame_id", "a number, as COCO's image_id is one", repr(frame_id), "give one file a frame")
-    return int(frame_id)

@@ -11,10 +11,11 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.files.read_files import Line, finite_numbers, read_lines
+from directshape_torch.files.read_files import Line, finite_numbers, read_lines, remembered
 from directshape_torch.numerics.checks import is_no_rotation
 
 
+@remembered
 def read_times(path: Path | str) -> NDArray[np.float64]:
     """Seconds (N,) from the first line on.
 
@@ -29,6 +30,7 @@ def read_times(path: Path | str) -> NDArray[np.float64]:
     return seconds - seconds[:1]
 
 
+@remembered
 def read_poses(path: Path | str) -> NDArray[np.float64]:
     """Poses (N, 4, 4) of camera 0, the frame `ref` of boxes, in that of the first line: small numbers, for float32.
 

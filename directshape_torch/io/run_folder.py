@@ -19,11 +19,12 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.errors import ConfigError, DataFormatError, InputError
+from directshape_torch.errors import ConfigError, DataFormatError
 from directshape_torch.files.read_files import is_frame_id, parse_json, read_bytes
 from directshape_torch.files.schema import record_of
 from directshape_torch.geometry.box3d import rotation_about_y
 from directshape_torch.io.config_files import config_from_mapping
+from directshape_torch.io.frame_layout import frames_among
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.result_files import ShapeArrays, read_shapes
 from directshape_torch.io.run_manifest import FrameEntry, hash_bytes, read_manifest
@@ -201,7 +202,9 @@ class RunFolder:
             cure = "give the folder of --out of 'directshape refine'"
             raise DataFormatError(summary_path(self.path), "is missing", cure=cure)
         self.manifest = manifest
-        self.frame_ids = tuple(_chosen(self.path, done_frames(self.path), frames))
+        done = done_frames(self.path)
+        chosen = done if frames is None else sorted(frames_among(done, frames, f"finished frames of {self.path}"))
+        self.frame_ids = tuple(chosen)
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -241,24 +244,6 @@ def done_frames(out_dir: Path) -> list[str]:
     texts = {path.stem for path in (out_dir / "data").glob("*.txt")}
     stems = (path.stem for path in (out_dir / "shapes").glob("*.npz"))
     return sorted(stem for stem in stems if stem in texts and is_frame_id(stem))
-
-
-def _chosen(out_dir: Path, done: Sequence[str], wanted: Iterable[str | int] | None) -> list[str]:
-    """Of the frames that are done those that are meant by ids, or by numbers with leading zeros or without."""
-    if wanted is None:
-        return list(done)
-    # The ids after the numbers, so that they win.
-    known = {_number(name): name for name in done} | {name: name for name in done}
-    words = [str(one) for one in wanted]
-    missing = [word for word in words if word not in known and _number(word) not in known]
-    if missing:
-        raise InputError("frames", f"finished frames of {out_dir}", ", ".join(missing[:5]))
-    return sorted({known[word] if word in known else known[_number(word)] for word in words})
-
-
-def _number(word: str) -> str:
-    """A number without leading zeros; other names as they are."""
-    return word.lstrip("0") or "0" if word.isdecimal() else word
 
 
 def _object(line: KittiObject, car: int, shapes: ShapeArrays) -> ResultObject:

@@ -9,7 +9,6 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, TypedDict
 
@@ -18,7 +17,7 @@ from torch import Tensor
 
 from directshape_torch.errors import DataFormatError, ResumeError, shown
 from directshape_torch.files import atomic_files
-from directshape_torch.files.read_files import is_frame_id, read_bytes, read_json
+from directshape_torch.files.read_files import is_frame_id, read_bytes, read_json, remembered
 from directshape_torch.files.schema import check_type, record_of
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -92,18 +91,9 @@ def hash_bytes(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def hash_file(path: Path | str) -> str:
-    """The sha256 of a file, hexadecimal; remembered while its size and time of change stay the same."""
-    path = Path(path)
-    if not path.is_file():
-        return hash_bytes(read_bytes(path))
-    state = path.stat()
-    return _hash_in_state(path, state.st_size, state.st_mtime_ns)
-
-
-# Mask files of a whole data set serve every frame, and may be large.
-@lru_cache(maxsize=256)
-def _hash_in_state(path: Path, _size_bytes: int, _changed_ns: int) -> str:
+@remembered
+def hash_file(path: Path) -> str:
+    """The sha256 of a file, hexadecimal; mask files of a whole data set serve every frame, and may be large."""
     return hash_bytes(read_bytes(path))
 
 

@@ -17,14 +17,14 @@ from directshape_torch.errors import DirectShapeError, InputError, shown
 from directshape_torch.files.read_files import is_frame_id, read_lines
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.folder_layout import FolderLayout
 from directshape_torch.io.frame_detections import build_detections
-from directshape_torch.io.frame_layout import FrameLayout, existing_folder
+from directshape_torch.io.frame_layout import FrameFiles, FrameLayout, existing_folder, frames_among
 from directshape_torch.io.image_files import read_disparity, read_pair
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_calibration import camera_of_rig, plane_ref_to_cam, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.io.kitti_layout import object_layout, raw_layout, stereo2015_layout, tracking_layout
+from directshape_torch.io.layouts import folder_layout, object_layout, raw_layout, stereo2015_layout, tracking_layout
+from directshape_torch.io.mask_files import LayoutMasks
 from directshape_torch.io.track_association import associate
 from directshape_torch.io.velodyne import in_image, read_scan
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane
@@ -32,12 +32,14 @@ from directshape_torch.stereo_matching.plane_from_points import estimate_ground_
 
 GroundSource = Literal["auto", "file", "stereo", "camera_height"]
 LayoutName = Literal["kitti", "raw", "tracking", "stereo2015", "folder"]
+# `NNNNNN_10.png`, as submissions to KITTI Stereo 2015 call the first pair of a scene, else `NNNNNN.png`.
+_DISPARITIES = ("_10.png", ".png")
 _LAYOUTS: dict[LayoutName, Callable[..., FrameLayout]] = {
     "kitti": object_layout,
     "raw": raw_layout,
     "tracking": tracking_layout,
     "stereo2015": stereo2015_layout,
-    "folder": FolderLayout,
+    "folder": folder_layout,
 }
 
 
@@ -130,12 +132,13 @@ def open_dataset(
     if ground not in get_args(GroundSource):
         raise InputError("ground", f"one of {', '.join(get_args(GroundSource))}", repr(ground))
     frame_ids = _chosen_frames(layout, split, frames)
-    if tracks and layout.sequence_of(frame_ids[0]) is None:
+    first = layout.files(frame_ids[0])
+    if tracks and first.sequence is None:
         raise InputError("tracks", "a layout of sequences: tracking, raw or folder", "frames by themselves")
-    # Masks from elsewhere know nothing of the layout's own links between masks and detections.
-    has_own_masks = masks is None
-    if masks is None or isinstance(masks, (str, Path)):
-        masks = layout.masks(None if masks is None else Path(masks))
+    if isinstance(masks, (str, Path)):
+        masks = LayoutMasks(layout, existing_folder(Path(masks), "is not a folder of masks"))
+    elif masks is None and first.detections.suffix == ".json":
+        masks = LayoutMasks(layout, None)
     return StereoDataset(
         layout,
         masks,
@@ -148,7 +151,6 @@ def open_dataset(
         _folder(lidar_dir, "LiDAR scans"),
         tracks,
         dtype,
-        has_own_masks,
     )
 
 
@@ -171,7 +173,6 @@ class StereoDataset:
     lidar_dir: Path | None
     tracks: bool
     dtype: torch.dtype
-    has_own_masks: bool  # the masks are the layout's
     # By sequence and frame, made when they are first asked for.
     _tracks: dict[str | None, dict[str, list[int]]] = field(default_factory=dict, init=False, repr=False)
 
@@ -184,30 +185,30 @@ class StereoDataset:
         Raises:
             DataFormatError: a file is missing or damaged; names file and reason.
         """
-        left, right = read_pair(*self.layout.images(frame_id))
+        files = self.layout.files(frame_id)
+        left, right = read_pair(files.left, files.right)
         height, width = left.shape[:2]
-        camera = camera_of_rig(self.layout.calibration(frame_id), self.disparity_fields, (width, height), self.dtype)
-        time_s, T_world_cam = self._motion(frame_id, camera)
+        camera = camera_of_rig(files.read_calibration(), self.disparity_fields, (width, height), self.dtype)
+        time_s, T_world_cam = self._motion(files, camera)
         frame = FrameBatch(
             images_left=_to_tensor(left, self.dtype),
             images_right=_to_tensor(right, self.dtype),
             sizes=torch.tensor([[height, width]]),
             camera=camera,
-            ground=self._ground(frame_id, left, right, camera),
+            ground=self._ground(files, left, right, camera),
             frame_ids=(frame_id,),
-            disparity=self._disparity(frame_id, (height, width)),
+            disparity=self._disparity(files, (height, width)),
             points_cam=self._points(frame_id, (height, width)),
             time_s=time_s,
             T_world_cam=T_world_cam,
         )
-        objects = self.objects(frame_id)
+        objects = files.read_objects()
         masks = [] if self.masks is None else self.masks.read(frame_id, (height, width))
-        given = self.layout.given_masks(frame_id) if self.has_own_masks else None
-        detections, rows, mask_tracks = build_detections(objects, masks, camera, (height, width), self.classes, given)
+        detections, rows, mask_tracks = build_detections(objects, masks, camera, (height, width), self.classes)
         if self.tracks:
             detections = replace(detections, track_id=self._track_id(frame_id, rows, mask_tracks))
         sequence = self.sequence_of(frame_id)
-        return LoadedFrame(frame, detections, objects, rows, self.layout.labels(frame_id), sequence)
+        return LoadedFrame(frame, detections, objects, rows, files.read_labels(), sequence)
 
     def scan(self, frame_id: str) -> tuple[Tensor, StereoCamera]:
         """All points (P, 3) of the LiDAR scan of a frame in its left camera, metres, float64, and that camera.
@@ -220,39 +221,37 @@ class StereoDataset:
         """
         if self.lidar_dir is None:
             raise InputError("dataset", "one with LiDAR scans", "none", "open it with lidar_dir=..")
-        calibration = self.layout.lidar_calibration(frame_id)
+        files = self.layout.files(frame_id)
+        calibration = files.read_lidar_calibration()
         camera = to_stereo_camera([calibration], dtype=torch.float64)
-        return read_scan(self.layout.lidar_files(self.lidar_dir, frame_id)["lidar"], calibration, camera), camera
+        return read_scan(files.within(self.lidar_dir, ".bin"), calibration, camera), camera
 
     def objects(self, frame_id: str) -> list[KittiObject]:
         """The detections of a frame alone, without its images."""
-        return self.layout.objects(frame_id)
+        return self.layout.files(frame_id).read_objects()
 
     def sequence_of(self, frame_id: str) -> str | None:
         """The sequence through which the tracks of a frame go, "" where there is but one; None: it has no tracks."""
-        return self.layout.sequence_of(frame_id) if self.tracks else None
+        return self.layout.files(frame_id).sequence if self.tracks else None
 
     def input_files(self, frame_id: str) -> dict[str, Path]:
         """The files that `load` reads for a frame and that bear on its result, by their role."""
-        left, right = self.layout.images(frame_id)
-        files = {
-            "image_left": left,
-            "image_right": right,
-            "calibration": self.layout.calibration_path(frame_id),
-            "detections": self.layout.detection_path(frame_id),
+        files = self.layout.files(frame_id)
+        roles = {
+            "image_left": files.left,
+            "image_right": files.right,
+            "calibration": files.calibration,
+            "detections": files.detections,
+            "disparity": self.disparity_dir and files.within(self.disparity_dir, *_DISPARITIES),
+            "lidar": self.lidar_dir and files.within(self.lidar_dir, ".bin"),
+            "lidar_calibration": self.lidar_dir and files.velo_to_cam,
+            "times": files.times if self.tracks else None,
+            "poses": files.trajectory if self.tracks else None,
+            "ground_plane": files.plane if self.ground in ("auto", "file") and files.plane.is_file() else None,
         }
-        if self.disparity_dir is not None:
-            files["disparity"] = self.layout.disparity_path(self.disparity_dir, frame_id)
-        if self.lidar_dir is not None:
-            files |= self.layout.lidar_files(self.lidar_dir, frame_id)
-        if self.tracks:
-            files |= self.layout.motion_files(frame_id)
-        plane = self.layout.plane_path(frame_id)
-        if self.ground in ("auto", "file") and plane is not None:
-            files["ground_plane"] = plane
         if self.masks is not None:
-            files |= {f"masks_{index}": path for index, path in enumerate(self.masks.files(frame_id))}
-        return files
+            roles |= {f"masks_{index}": path for index, path in enumerate(self.masks.files(frame_id))}
+        return {role: path for role, path in roles.items() if path is not None}
 
     def _track_id(self, frame_id: str, rows: tuple[int, ...], mask_tracks: tuple[int, ...]) -> Tensor:
         """(B,) of the detections: by the masks, else by the detections themselves."""
@@ -268,7 +267,7 @@ class StereoDataset:
         """Of all frames of a sequence, whichever of them are used: those of its files, or associated."""
         objects: dict[str, list[KittiObject]] = {}
         for frame_id in self.layout.frame_ids():
-            if self.layout.sequence_of(frame_id) == sequence:
+            if self.layout.files(frame_id).sequence == sequence:
                 # A file that cannot be read is reported when its turn comes.
                 with contextlib.suppress(DirectShapeError, OSError):
                     objects[frame_id] = self.objects(frame_id)
@@ -277,10 +276,10 @@ class StereoDataset:
             return given
         return dict(zip(objects, associate(list(objects.values())), strict=True))
 
-    def _disparity(self, frame_id: str, size_hw: tuple[int, int]) -> Tensor | None:
+    def _disparity(self, files: FrameFiles, size_hw: tuple[int, int]) -> Tensor | None:
         if self.disparity_dir is None:
             return None
-        disparity = read_disparity(self.layout.disparity_path(self.disparity_dir, frame_id), size_hw)
+        disparity = read_disparity(files.within(self.disparity_dir, *_DISPARITIES), size_hw)
         return torch.from_numpy(disparity)[None].to(self.dtype)
 
     def _points(self, frame_id: str, size_hw: tuple[int, int]) -> Tensor | None:
@@ -289,9 +288,9 @@ class StereoDataset:
         points, camera = self.scan(frame_id)
         return in_image(points, size_hw, camera)[None].to(self.dtype)
 
-    def _motion(self, frame_id: str, camera: StereoCamera) -> tuple[Tensor | None, Tensor | None]:
+    def _motion(self, files: FrameFiles, camera: StereoCamera) -> tuple[Tensor | None, Tensor | None]:
         """Time (1,) and pose (1, 4, 4) of the left camera, where cars have numbers and that is known."""
-        time_s, T_world_ref = self.layout.motion(frame_id) if self.tracks else (None, None)
+        time_s, T_world_ref = files.read_motion() if self.tracks else (None, None)
         T_world_cam = None
         if T_world_ref is not None:
             T_world_cam = torch.from_numpy(T_world_ref)[None].clone()
@@ -300,7 +299,7 @@ class StereoDataset:
         return None if time_s is None else torch.tensor([time_s], dtype=self.dtype), T_world_cam
 
     def _ground(
-        self, frame_id: str, left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera
+        self, files: FrameFiles, left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera
     ) -> GroundPlane:
         """The plane of the first source that has one, of those that `self.ground` allows.
 
@@ -315,7 +314,7 @@ class StereoDataset:
         }
         for source in orders[self.ground]:
             if source == "file":
-                plane_cam = self._plane_from_file(frame_id, camera)
+                plane_cam = self._plane_from_file(files, camera)
             else:
                 plane_cam = estimate_ground_plane(left, right, camera)
             if plane_cam is not None:
@@ -323,10 +322,11 @@ class StereoDataset:
                 return GroundPlane(normal.reshape(1, 3), offset.reshape(1), (source,))
         return GroundPlane.from_camera_height(self.camera_height_m).to(dtype=self.dtype)
 
-    def _plane_from_file(self, frame_id: str, camera: StereoCamera) -> tuple[Tensor, Tensor] | None:
-        if self.ground == "auto" and self.layout.plane_path(frame_id) is None:
+    def _plane_from_file(self, files: FrameFiles, camera: StereoCamera) -> tuple[Tensor, Tensor] | None:
+        known = files.read_plane(needed=self.ground == "file")
+        if known is None:
             return None
-        plane_ref = torch.from_numpy(self.layout.plane_ref(frame_id))
+        plane_ref = torch.from_numpy(known)
         return plane_ref[:3], plane_ref_to_cam(plane_ref[:3], plane_ref[3], camera.t_cam_ref[0].double())
 
 
@@ -339,18 +339,12 @@ def _chosen_frames(
     layout: FrameLayout, split: Path | str | None, frames: Iterable[str | int] | None
 ) -> tuple[str, ...]:
     known = layout.frame_ids() if split is None else list(dict.fromkeys(line.text for line in read_lines(split)))
-    if frames is not None:
-        names = (layout.frame_id(frame) if isinstance(frame, int) else frame for frame in frames)
-        # A frame that is named twice is one frame.
-        wanted = list(dict.fromkeys(names))
-        if missing := [frame for frame in wanted if frame not in set(known)]:
-            where = split if split is not None else layout.detections_dir
-            raise InputError("frames", f"ids that occur in {where}", ", ".join(missing[:5]))
-        known = wanted
+    where = f"{layout.detections_dir}" if split is None else f"{split}"
     if not known:
-        files = f"detection file {layout.detection_file_name} in {layout.detections_dir}"
+        files = f"detection file {layout.detection_file_name} in" if split is None else "frame in"
         cure = "name the folder that holds these files" if split is None else ""
-        raise InputError("frames", f"at least one {files if split is None else f'frame in {split}'}", "none", cure)
+        raise InputError("frames", f"at least one {files} {where}", "none", cure)
+    known = known if frames is None else frames_among(known, frames, f"ids that occur in {where}")
     for frame_id in known:
         if not is_frame_id(frame_id):
             where = "frames" if split is None else f"{split}, frames"

@@ -33,12 +33,12 @@ class InputReader:
         """All lines that went in."""
         if self.dataset is None or not self.has_detections:
             return None
-        usable = self._are_unchanged(result, {"detections": self.dataset.layout.detection_path(result.frame_id)})
+        usable = self._are_unchanged(result, {"detections": self.dataset.layout.files(result.frame_id).detections})
         return self.dataset.objects(result.frame_id) if usable else None
 
     def labels(self, frame_id: str) -> list[KittiObject] | None:
         """The ground truth, which no run reads and so no hash can tell."""
-        return None if self.dataset is None else self.dataset.layout.labels(frame_id)
+        return None if self.dataset is None else self.dataset.layout.files(frame_id).read_labels()
 
     def read(self, result: FrameResult) -> LoadedFrame | None:
         """Images, camera, ground and masks of a frame, if they are those that went in."""
@@ -49,8 +49,8 @@ class InputReader:
         except DataFormatError as error:
             # The list of a frame's masks is itself a file.
             self.problems[f"{error.path.name} not found or damaged"].add(result.frame_id)
-            files = dict(zip(("image_left", "image_right"), self.dataset.layout.images(result.frame_id), strict=True))
-            self._are_unchanged(result, files)
+            found = self.dataset.layout.files(result.frame_id)
+            self._are_unchanged(result, {"image_left": found.left, "image_right": found.right})
             return None
         # Of `detections` what stands in cannot be the same.
         kept = {role: path for role, path in files.items() if role != "detections" or self.has_detections}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal, get_args
@@ -17,10 +17,10 @@ from torch import Tensor
 
 from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
 from directshape_torch.geometry.projection import project
-from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.frame_layout import image_stems
-from directshape_torch.io.image_files import find_image, read_disparity, read_pair, read_rgb
-from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration, to_stereo_camera
+from directshape_torch.io.frame_layout import FrameFiles, frames_among
+from directshape_torch.io.image_files import read_disparity, read_pair, read_rgb
+from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
+from directshape_torch.io.layouts import tracking_layout
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.io.velodyne import read_scan
 from directshape_torch.rig.estimate import RigEstimate, rig_among
@@ -65,7 +65,7 @@ def _frames_by_rig(dataset: StereoDataset) -> list[list[str]]:
     groups: dict[bytes, list[str]] = {}
     for frame_id in dict.fromkeys([*dataset.layout.frame_ids(), *dataset.frame_ids]):
         with suppress(DirectShapeError, OSError):
-            calibration = dataset.layout.calibration(frame_id)
+            calibration = dataset.layout.files(frame_id).read_calibration()
             groups.setdefault(calibration.P2.tobytes() + calibration.P3.tobytes(), []).append(frame_id)
     return list(groups.values())
 
@@ -92,8 +92,9 @@ def _rig_of_first(dataset: StereoDataset, frame_ids: Sequence[str], rigs: list[R
     """That of the first frame whose left image can be read; a rig whose frames have no cars is one too."""
     for frame_id in frame_ids:
         with suppress(DirectShapeError, OSError):
-            height, width = read_rgb(dataset.layout.images(frame_id)[0]).shape[:2]
-            camera = to_stereo_camera([dataset.layout.calibration(frame_id)], dtype=torch.float64)
+            files = dataset.layout.files(frame_id)
+            height, width = read_rgb(files.left).shape[:2]
+            camera = to_stereo_camera([files.read_calibration()], dtype=torch.float64)
             return rig_among(rigs, Rig.of(camera, (width, height)))
     return None
 
@@ -106,11 +107,8 @@ def _evenly(frame_ids: Sequence[str]) -> list[str]:
 
 def truth_files(root: Path, source: TruthSource) -> dict[str, Path]:
     """The files of a source by frame id; of a stereo pair 2015 the first image (`NNNNNN_10`) keeps its full name."""
-    training = root / "training"
-    if not training.is_dir():
-        raise DataFormatError(root, "holds no folder 'training'", cure="give the folder above it, in KITTI's layout")
     patterns = ("disp_noc_0/*.png", "disp_occ_0/*.png") if source == "disparity" else ("velodyne/*.bin",)
-    files = {path.stem: path for pattern in patterns for path in sorted(training.glob(pattern))}
+    files = {path.stem: path for pattern in patterns for path in sorted((root / "training").glob(pattern))}
     if not files:
         wanted = " or ".join(f"training/{pattern}" for pattern in patterns)
         cure = f"choose one of --from {', '.join(get_args(TruthSource))}"
@@ -118,22 +116,9 @@ def truth_files(root: Path, source: TruthSource) -> dict[str, Path]:
     return dict(sorted(files.items()))
 
 
-def chosen_frames(known: Sequence[str], frames: Sequence[int | str] | None) -> list[str]:
-    """The wanted frames among those that are known, a number for a name with leading zeros; all if `frames` is None."""
-    if frames is None:
-        return list(known)
-    by_word = {word: name for name in known for word in (name, int(name) if name.isdecimal() else name)}
-    missing = [str(frame) for frame in frames if frame not in by_word]
-    if missing:
-        raise InputError("frames", f"ids among {', '.join(known[:5])} ...", ", ".join(missing[:5]), "check --frames")
-    return list(dict.fromkeys(by_word[frame] for frame in frames))
-
-
-def observe_frame(root: Path, frame_id: str, truth: Path, source: TruthSource) -> Frame:
+def observe_frame(files: FrameFiles, truth: Path, source: TruthSource) -> Frame:
     """Read one frame and measure its disparities where the truth is known."""
-    training = root / "training"
-    calibration = read_calibration(training / "calib" / f"{frame_id}.txt")
-    left, right = read_pair(*(find_image(training / name, frame_id) for name in ("image_2", "image_3")))
+    calibration, (left, right) = files.read_calibration(), read_pair(files.left, files.right)
     rig = Rig.of(to_stereo_camera([calibration], dtype=torch.float64), (left.shape[1], left.shape[0]))
     known = _of_map(truth, rig) if source == "disparity" else known_depth_from_lidar(truth, calibration, rig)
     return rig, observe_disparity(MatchedPair.of(left, right), rig, known)
@@ -180,71 +165,50 @@ def _hidden(uv: Tensor, disparity: Tensor, size_wh: tuple[int, int]) -> Tensor:
     return torch.from_numpy(around).double() > disparity + _HIDDEN_BY_PX
 
 
-@dataclass(frozen=True)
-class StereoSequence:
-    """Where the frames of a sequence are."""
-
-    root: Path  # folder that holds `image_02`, `image_03` and `calib.txt`
-    frame_ids: tuple[str, ...]  # in their order in time
-    camera: StereoCamera  # the rig's calibration (one frame, float64)
-
-    def gaps(self) -> tuple[tuple[str, str], ...]:
-        """Neighbours whose numbers are farther apart than those of the closest pair; none where ids are no numbers."""
-        if not all(frame_id.isdecimal() for frame_id in self.frame_ids):
-            return ()
-        pairs = {(before, after): int(after) - int(before) for before, after in pairwise(self.frame_ids)}
-        return tuple(pair for pair, step in pairs.items() if step > min(pairs.values()))
-
-
-def open_sequence(root: Path, frames: Sequence[int | str] | None = None) -> StereoSequence:
-    """The sequence in a folder with `image_02`, `image_03` and `calib.txt` (lines P2 and P3).
+def open_sequence(root: Path, frames: Sequence[int | str] | None = None) -> dict[str, FrameFiles]:
+    """The frames of a sequence of KITTI's tracking benchmark, in their order in time.
 
     `frames` are ids of consecutive frames of a moving car, None for all. Raises `DataFormatError` for a file that is
     missing, `InputError` for fewer than two frames.
     """
-    left, right = (_images(root, name) for name in ("image_02", "image_03"))
-    chosen = tuple(sorted(chosen_frames(left, frames), key=_in_time))
-    if len(chosen) < 2:
-        raise InputError("frames", "at least two consecutive frames", str(len(chosen)), "give more frames")
+    layout = tracking_layout(root, root)
+    known = layout.image_ids()
+    chosen = known if frames is None else frames_among(known, frames, "ids of images")
+    # Numbers with and without leading zeros.
+    found = {frame_id: layout.files(frame_id) for frame_id in sorted(chosen, key=lambda name: (len(name), name))}
+    if len({files.sequence for files in found.values()}) > 1 or len(found) < 2:
+        cure = "give the folder of one sequence, and more frames"
+        raise InputError("frames", "at least two consecutive frames of one sequence", str(len(found)), cure)
     # Now rather than after minutes of work on the frames before it.
-    if lonely := [frame_id for frame_id in chosen if frame_id not in right]:
-        problem = f"has no image of {', '.join(lonely[:5])}"
+    if lonely := [frame_id for frame_id, files in found.items() if not files.right.is_file()]:
         cure = "add the right image of every frame, or leave frames out with --frames"
-        raise DataFormatError(root / "image_03", problem, cure=cure)
-    camera = to_stereo_camera([read_calibration(root / "calib.txt")], dtype=torch.float64)
-    return StereoSequence(root, chosen, camera)
+        raise DataFormatError(root / "image_03", f"has no image of {', '.join(lonely[:5])}", cure=cure)
+    return found
 
 
-def _images(root: Path, name: str) -> list[str]:
-    """Ids of the images in a subfolder, in time."""
-    found = image_stems(root / name)
-    if not found:
-        cure = "--from motion needs consecutive frames: a folder with image_02, image_03 and calib.txt"
-        raise DataFormatError(root, f"holds no {name}/*.png", cure=cure)
-    return sorted(found, key=_in_time)
+def gaps(frame_ids: Sequence[str]) -> list[tuple[str, str]]:
+    """Neighbours whose numbers are farther apart than those of the closest pair; none where ids are no numbers."""
+    if not all(frame_id.isdecimal() for frame_id in frame_ids):
+        return []
+    pairs = {(before, after): int(after) - int(before) for before, after in pairwise(frame_ids)}
+    return [pair for pair, step in pairs.items() if step > min(pairs.values())]
 
 
-def _in_time(frame_id: str) -> tuple[int, str]:
-    """Numbers in their order, with and without leading zeros."""
-    return len(frame_id), frame_id
+def observe_motion(frames: Iterable[FrameFiles], height_m: float | None) -> list[FieldConstraint]:
+    """Read frames of one rig one after the other and collect what they show; without a camera height not of the road.
 
-
-def observe_motion(
-    sequence: StereoSequence, height_m: float | None, frame_ids: Iterable[str] | None = None
-) -> list[FieldConstraint]:
-    """Read the frames one after the other and collect what they show; without a camera height not of the road.
-
-    `frame_ids` are the sequence's own, as an iterator that shows progress, say.
+    An iterator may show progress.
     """
     constraints: list[FieldConstraint] = []
     waiting: deque[StereoFeatures] = deque(maxlen=max(STEPS) + 1)
-    for frame_id in sequence.frame_ids if frame_ids is None else frame_ids:
-        left, right = read_pair(*(find_image(sequence.root / name, frame_id) for name in ("image_02", "image_03")))
-        rig = Rig.of(sequence.camera, (left.shape[1], left.shape[0]))
+    for files in frames:
+        left, right = read_pair(files.left, files.right)
+        camera = to_stereo_camera([files.read_calibration()], dtype=torch.float64)
+        rig = Rig.of(camera, (left.shape[1], left.shape[0]))
         if waiting and waiting[0].rig.size_wh != rig.size_wh:
             (width, height), before = rig.size_wh, waiting[0].rig.size_wh
             problem = f"is {width} x {height}, the frames before it {before[0]} x {before[1]}"
-            raise DataFormatError(sequence.root / "image_02" / frame_id, problem, cure="give frames of one rig")
+            raise DataFormatError(files.left, problem, cure="give frames of one rig")
         pair = MatchedPair.of(left, right)
         road = None if height_m is None else find_road(pair, rig, height_m)
         constraints += [] if road is None else [road]

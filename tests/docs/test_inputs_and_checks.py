@@ -8,7 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import get_args
 
-from directshape_torch.io import folder_layout
+from directshape_torch.io import folder_files
 from directshape_torch.io.stereo_dataset import LayoutName
 from directshape_torch.scene_check.conventions import all_conventions
 from directshape_torch.scene_check.finding import MISTAKES
@@ -30,7 +30,7 @@ def test_every_layout_is_in_the_table() -> None:
 
 def test_keys_of_the_folder() -> None:
     documented = first_column(INPUTS.split("## A plain folder")[1])
-    kinds = (folder_layout.FolderRig, folder_layout.FolderFrame, folder_layout.FolderObject)
+    kinds = (folder_files.FolderRig, folder_files.FolderFrame, folder_files.FolderObject)
     keys = {field.name.replace("object_class", "class") for kind in kinds for field in fields(kind)}
     assert documented == keys - {"comment"} | {"schema_version"}
 
@@ -39,7 +39,7 @@ def test_the_smallest_frame_is_one(tmp_path: Path) -> None:
     (example,) = re.findall(r"```json\n(.*?)```", INPUTS, flags=re.DOTALL)
     path = tmp_path / "000000.json"
     path.write_text(json.dumps(json.loads(example)))
-    (car,) = folder_layout.read_frame(path).objects
+    (car,) = folder_files.read_frame(path).objects
     assert car.bottom_center_m == [-3.2, 1.6, 14.0]
 
 

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from directshape_torch.export.export_run import export_run
 from directshape_torch.export.painted_cars import MIRRORED, NEUTRAL, NEUTRAL_RGB, SEEN
-from directshape_torch.io.kitti_layout import KittiLayout
+from directshape_torch.io.frame_layout import FrameFiles
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder
 
@@ -196,7 +196,7 @@ def test_a_car_moves_through_the_poses_of_its_track(
 ) -> None:
     if interval_s is not None:
         motion = {"000000": (7.0, None), "000001": (7.0 + interval_s, None)}
-        monkeypatch.setattr(KittiLayout, "motion", lambda _, frame_id: motion[frame_id])
+        monkeypatch.setattr(FrameFiles, "read_motion", lambda files: motion[files.stems[0]])
     run = with_tracks(finished, tmp_path / "run", ("000007", ""), [(0, -1), (0, -1)])
     export_run(run, tmp_path, ["glb"], finished.inputs())
     assert sorted(path.stem for path in (tmp_path / "glb").iterdir()) == ["000000", "000001", "track_000007"]

@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.io.folder_layout import FOLDER_SCHEMA_VERSION
+from directshape_torch.io.folder_files import FOLDER_SCHEMA_VERSION
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 

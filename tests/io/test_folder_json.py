@@ -12,9 +12,11 @@ import pytest
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_png
-from directshape_torch.io.folder_layout import FolderLayout, FolderMasks, read_frame, read_rig
+from directshape_torch.io.folder_files import read_frame, read_rig
 from directshape_torch.io.instance_masks import MaskSizeError
 from directshape_torch.io.kitti_calibration import camera_of_rig
+from directshape_torch.io.layouts import folder_layout
+from directshape_torch.io.mask_files import LayoutMasks
 
 RIG: dict[str, Any] = {
     "schema_version": 1,
@@ -70,7 +72,7 @@ def test_rig(root: Path) -> None:
     P2, P3 = rig.projections()
     assert list(rig.image_size_wh) == [60, 40]
     assert np.array_equal(P3[:, :3], P2[:, :3])
-    calibration = FolderLayout(root).calibration("a")
+    calibration = folder_layout(root).files("a").read_calibration()
     # P3[0, 3] = -fx b.
     assert calibration.P3[0, 3] == -25.0
     assert not calibration.P2[:, 3].any()
@@ -80,39 +82,42 @@ def test_rig(root: Path) -> None:
 
 
 def test_objects_become_lines_of_results(root: Path) -> None:
-    car, person = FolderLayout(root).objects("a")
+    car, person = folder_layout(root).files("a").read_objects()
     assert (car.hwl, car.location_ref, car.rotation_y, car.score) == ((1.5, 1.6, 4), (0, 1.5, 10), -1.6, 1.0)
     assert car.alpha == pytest.approx(-1.6)
     # Width 1.6 at 10 - 2 m in front: 50 * 0.8 / 8 = 5 px to each side, a little more as the car stands askew.
     assert car.box_2d[0] == pytest.approx(30 - 5, abs=0.6)
     assert car.box_2d[2] == pytest.approx(30 + 5, abs=0.6)
     assert not person.has_box_3d
-    assert FolderLayout(root).labels("a") is None
+    assert folder_layout(root).files("a").read_labels() is None
 
 
 def test_masks_are_probabilities(root: Path) -> None:
-    (mask,) = FolderMasks(root, root / "frames").read("a", (40, 60))
+    masks = LayoutMasks(folder_layout(root), None)
+    (mask,) = masks.read("a", (40, 60))
     assert (mask.instance_id, mask.side, mask.is_car) == (0, "left", True)
     assert mask.probability.max() == pytest.approx(200 / 255)
     assert mask.mask_box == (20, 15, 39, 24)
-    assert FolderMasks(root, root / "frames").files("a") == (root / "masks" / "a.png",)
+    assert masks.files("a") == (root / "masks" / "a.png",)
     with pytest.raises(MaskSizeError, match="the soft mask has 60 x 40 pixels"):
-        FolderMasks(root, root / "frames").read("a", (80, 60))
+        masks.read("a", (80, 60))
 
 
 def test_plane_and_labels(root: Path) -> None:
     write(root, "frames/a.json", {**FRAME, "ground_plane": [0, 2, 0, -3], "labels": [CAR]})
-    layout = FolderLayout(root)
-    assert layout.plane_ref("a").tolist() == [0, -1, 0, 1.5]
-    labels = layout.labels("a")
+    files = folder_layout(root).files("a")
+    plane, labels = files.read_plane(), files.read_labels()
+    assert plane is not None
+    assert plane.tolist() == [0, -1, 0, 1.5]
     assert labels is not None
     assert labels[0].score is None
     write(root, "frames/a.json", {**FRAME, "ground_plane": [1, 0, 0, -3]})
     with pytest.raises(DataFormatError, match=r"the normal is not near the vertical.*docs/inputs\.md"):
-        layout.plane_ref("a")
+        files.read_plane()
     write(root, "frames/a.json", FRAME)
     with pytest.raises(DataFormatError, match="holds no 'ground_plane'"):
-        layout.plane_ref("a")
+        files.read_plane(needed=True)
+    assert files.read_plane() is None
 
 
 @pytest.mark.parametrize(

@@ -172,7 +172,7 @@ def test_frames_split_and_order(root: Path) -> None:
     split.write_text("000002\n000000\n\n000002\n")
     assert dataset(root, split=split).frame_ids == ("000002", "000000")
     assert len(dataset(root, split=split, frames=["000000"])) == 1
-    with pytest.raises(InputError, match=r"frames: expected ids that occur in .*val\.txt, got 000004"):
+    with pytest.raises(InputError, match=r"frames: expected ids that occur in .*val\.txt, such as 000002, got 4"):
         dataset(root, split=split, frames=[4])
 
 

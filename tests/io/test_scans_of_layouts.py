@@ -45,7 +45,10 @@ def layout_of(name: LayoutName, root: Path, kitti: Path, stem: str, to: Path) ->
 
 def scanned(layout: FrameLayout, frame_id: str, kitti: Path) -> Points:
     """Pixels and depths of the points that the left camera sees."""
-    calibration, scan = layout.lidar_calibration(frame_id), kitti / "training" / "velodyne" / f"{FRAME}.bin"
+    calibration, scan = (
+        layout.files(frame_id).read_lidar_calibration(),
+        kitti / "training" / "velodyne" / f"{FRAME}.bin",
+    )
     known = known_depth_from_lidar(scan, calibration, Rig.of(to_stereo_camera([calibration]), SIZE_WH))
     return known[:, :2], known[:, 2]
 
@@ -65,8 +68,8 @@ def test_tracking(kitti: Path, tmp_path: Path, expected: Points, single: bool) -
     layout = layout_of("tracking", tmp_path, kitti, frame_id, tmp_path)
     torch.testing.assert_close(scanned(layout, frame_id, kitti), expected)
     # `--lidar DIR` finds them in any folder.
-    named = layout.lidar_files(Path("scans"), frame_id)
-    assert named == {"lidar": Path("scans") / ("" if single else SEQUENCE) / f"{FRAME}.bin"}
+    named = layout.files(frame_id).within(Path("scans"), ".bin")
+    assert named == Path("scans") / ("" if single else SEQUENCE) / f"{FRAME}.bin"
 
 
 @pytest.mark.parametrize("single", [True, False])
@@ -82,9 +85,7 @@ def test_raw(kitti: Path, tmp_path: Path, expected: Points, single: bool) -> Non
         drive.parent / "calib_velo_to_cam.txt", f"calib_time: 15-Mar-2012 11:37:16\nR: {ROTATION}\nT: {TRANSLATION}\n"
     )
     torch.testing.assert_close(scanned(layout, frame_id, kitti), expected)
-    place = layout.lidar_files(Path("scans"), frame_id)["lidar_calibration"]
-    assert place == drive.parent / "calib_velo_to_cam.txt"
-    assert layout.lidar_calibration(frame_id).Tr_velo_to_cam is not None
+    assert layout.files(frame_id).velo_to_cam == drive.parent / "calib_velo_to_cam.txt"
 
 
 def test_place_of_a_scanner(tmp_path: Path) -> None:

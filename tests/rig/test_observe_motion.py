@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from directshape_torch.cli.main import make_parser
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import write_png
-from directshape_torch.rig.from_files import observe_motion, open_sequence
+from directshape_torch.rig.from_files import gaps, observe_motion, open_sequence
 from directshape_torch.rig.motion import MotionConstraint
 from directshape_torch.rig.rig_file import load_fields
 
@@ -49,7 +49,7 @@ def write_sequence(root: Path) -> None:
 def test_a_wall_is_followed_to_where_it_is(tmp_path: Path) -> None:
     """Three frames give steps 1, 2 and 1; the wall's pixels move away from the centre by the ratio of its depths."""
     write_sequence(tmp_path)
-    constraints = observe_motion(open_sequence(tmp_path), height_m=1.65)
+    constraints = observe_motion(open_sequence(tmp_path).values(), height_m=1.65)
     tracks = [c for c in constraints if isinstance(c, MotionConstraint) and c.rig.size_wh == SIZE]
     assert len(tracks) == len(constraints) == 3
     for track, ratio in zip(tracks, (12 / 11, 12 / 10, 11 / 10), strict=True):
@@ -71,7 +71,7 @@ def test_command_refuses_what_is_no_sequence(tmp_path: Path) -> None:
     with pytest.raises(DataFormatError, match="image_02"):
         calibrate(tmp_path, tmp_path / "bias.json")
     write_sequence(tmp_path)
-    with pytest.raises(InputError, match=r"among 000000.*, got 9"):
+    with pytest.raises(InputError, match=r"such as 000000, got 9"):
         calibrate(tmp_path, tmp_path / "bias.json", "--frames", "000000", "000009")
     with pytest.raises(InputError, match="at least two"):
         calibrate(tmp_path, tmp_path / "bias.json", "--frames", "000000")
@@ -84,10 +84,6 @@ def test_command_refuses_what_is_no_sequence(tmp_path: Path) -> None:
     right.unlink()
     with pytest.raises(DataFormatError, match=r"image_03: has no image of 000001; add the right image"):
         calibrate(tmp_path, tmp_path / "bias.json")
-    for image in (tmp_path / "image_03").iterdir():
-        image.unlink()
-    with pytest.raises(DataFormatError, match=r"holds no image_03/\*\.png; --from motion needs consecutive frames"):
-        calibrate(tmp_path, tmp_path / "bias.json")
     assert not (tmp_path / "bias.json").exists()
 
 
@@ -98,7 +94,9 @@ def test_calibration_and_sizes_that_do_not_fit_are_refused(tmp_path: Path) -> No
     with pytest.raises(DataFormatError, match=r"image_03/000001\.png: has 312 x 160 pixels, the left image 320"):
         calibrate(tmp_path, tmp_path / "bias.json")
     write_png(tmp_path / "image_02" / "000001.png", small)
-    with pytest.raises(DataFormatError, match=r"000001: is 312 x 160, the frames before it 320 x 160; give frames of"):
+    with pytest.raises(
+        DataFormatError, match=r"000001\.png: is 312 x 160, the frames before it 320 x 160; give frames of"
+    ):
         calibrate(tmp_path, tmp_path / "bias.json")
     (tmp_path / "calib.txt").write_text("P2: 300 0 160 0 0 300 80 0 0 0 1 0\n")
     with pytest.raises(DataFormatError, match="has no line P3:; a stereo pair needs"):
@@ -113,10 +111,10 @@ def test_frames_are_taken_in_time_and_gaps_are_named(tmp_path: Path) -> None:
     for folder in ("image_02", "image_03"):
         for number, name in enumerate(("9", "10", "14")):
             (tmp_path / folder / f"{number:06d}.png").rename(tmp_path / folder / f"{name}.png")
-    sequence = open_sequence(tmp_path)
-    assert sequence.frame_ids == ("9", "10", "14")
-    assert sequence.gaps() == (("10", "14"),)
-    assert open_sequence(tmp_path, ["10", "14"]).gaps() == ()
+    sequence = list(open_sequence(tmp_path))
+    assert sequence == ["9", "10", "14"]
+    assert gaps(sequence) == [("10", "14")]
+    assert gaps(list(open_sequence(tmp_path, ["14", 10]))) == []
 
 
 def test_frames_that_do_not_move_are_refused(tmp_path: Path) -> None:

@@ -135,7 +135,7 @@ def test_each_of_two_rigs_has_its_estimate_and_unknown_frames_are_refused(tmp_pa
     assert calibrate(tmp_path) == 0
     offsets = [rig.in_the_middle()[0] for rig in load_rigs(tmp_path / "bias.json")]
     assert offsets == pytest.approx([0.0, 0.5], abs=0.05)
-    with pytest.raises(InputError, match=r"among 000001, 000002 .*, got 9"):
+    with pytest.raises(InputError, match="such as 000001, got 9"):
         calibrate(tmp_path, "--frames", "000009")
 
 
@@ -143,11 +143,13 @@ def test_each_of_two_rigs_has_its_estimate_and_unknown_frames_are_refused(tmp_pa
     "DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA, the folder of KITTI frames, is not set"
 )
 def test_real_frame_has_the_known_field() -> None:
+    from directshape_torch.io.layouts import object_layout
     from directshape_torch.rig.from_files import add_truth, observe_frame, truth_files
 
     root = Path(os.environ["DIRECTSHAPE_DATA"]) / "kitti"
     rigs: list[RigEstimate] = []
-    add_truth(rigs, "disparity", [observe_frame(root, "007322", truth_files(root, "disparity")["007322"], "disparity")])
+    truth = truth_files(root, "disparity")["007322"]
+    add_truth(rigs, "disparity", [observe_frame(object_layout(root, root).files("007322"), truth, "disparity")])
     field = rigs[0].field
     left, middle, right = field.bias(torch.tensor([[60.0, 180.0], [620.0, 180.0], [1180.0, 150.0]]).double()).tolist()
     assert -1.6 < left < -0.6

@@ -14,7 +14,7 @@ import torch
 from demo_scene import camera, frame_files, labels, layout, motion, surfaces
 
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.kitti_layout import tracking_layout
+from directshape_torch.io.layouts import tracking_layout
 
 # pycocotools' decode predates numpy 2's protocol.
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
@@ -98,8 +98,8 @@ def test_a_sequence_has_the_files_of_the_tracking_benchmark(tmp_path: Path) -> N
     frame_files.write_sequence(tmp_path, "0001", frames, 0.3)
     found = tracking_layout(tmp_path, tmp_path / "detections" / "noisy_stereo")
     assert found.frame_ids() == ["0001_000000", "0001_000001"]
-    assert [line.score for line in found.objects("0001_000001")] == [0.9, 0.9]
-    assert len(found.labels("0001_000001") or []) == 2
+    assert [line.score for line in found.files("0001_000001").read_objects()] == [0.9, 0.9]
+    assert len(found.files("0001_000001").read_labels() or []) == 2
     # `poses` leads from a frame's camera 0 to the first one's: the road's origin must arrive where it was.
     T_first_second = np.vstack(
         [np.loadtxt(tmp_path / "training" / "poses" / "0001.txt")[1].reshape(3, 4), [0, 0, 0, 1]]
