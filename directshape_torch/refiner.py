@@ -17,11 +17,10 @@ from directshape_torch.errors import InputError, NoGradientWarning, SceneWarning
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.gradient_mode import is_within_transform
-from directshape_torch.numerics.records import kept
 from directshape_torch.observation.extents import scene_extents
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import check_fit, check_no_tangents, refusals, without_empty_masks
-from directshape_torch.refinement.outcome import Outcome
+from directshape_torch.refinement.outcome import as_they_came
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.scene_problem import TermFactory, problem_of_scene
@@ -30,7 +29,6 @@ from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.gauss_newton import search_start
-from directshape_torch.status import Status, is_refined
 from directshape_torch.terms.cars import CarBatch, CarState
 
 
@@ -174,15 +172,14 @@ class DirectShapeRefiner(nn.Module):
         problem = problem_of_scene(
             self.config, self.prior, frames, detections, cars, seen.of_objects(usable), self.extra_terms, term_weights
         )
-        # Detached: of cars that are not refined it is a value alone, and a NaN pose would have a NaN gradient here.
-        state, status = self._input_state(detections.T_cam_obj.detach(), cars), failure
-        outcome = Outcome.nothing(problem, CarState(*(part[:0] for part in state)))
-        if len(rows):
-            initial = self._input_state(detections.T_cam_obj.index_select(0, rows), cars)
-            outcome = self._minimise(problem, initial, cars)
-            state = CarState(*(full.index_copy(0, rows, part) for full, part in zip(state, outcome.state, strict=True)))
-            status = status.index_copy(0, rows, outcome.status)
-        return _assembled(self.prior, frames, detections, state, status, rows, outcome)
+        came = as_they_came(self.prior, frames, detections, failure, problem.term_names)
+        if not len(rows):
+            return came
+        initial = self._input_state(detections.T_cam_obj.index_select(0, rows), cars)
+        if len(rows) == len(came):
+            return self._minimise(problem, initial, cars, came)
+        found = self._minimise(problem, initial, cars, came.rows(rows))
+        return replace(came.put(rows, found), term_names=found.term_names, has_shape=found.has_shape)
 
     def problem(
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None = None
@@ -226,14 +223,16 @@ class DirectShapeRefiner(nn.Module):
         matched = with_disparity(frames, needed=detections.frame_index)
         return replace(seen, points=car_points(matched, detections, self.config.point_cloud))
 
-    def _minimise(self, problem: CarProblem, initial: CarState, cars: CarBatch) -> Outcome:
+    def _minimise(
+        self, problem: CarProblem, initial: CarState, cars: CarBatch, came: RefinementResult
+    ) -> RefinementResult:
         if self.config.method == "box_alignment":
             from directshape_torch.refinement.box_alignment import align_boxes
 
-            return align_boxes(problem, initial, cars)
+            return align_boxes(problem, initial, cars, came)
         with torch.no_grad():
             start = search_start(problem, initial, cars.search_moves(self.config.search))
-        return refined(problem, cars, initial, start)
+        return refined(problem, cars, initial, start, came)
 
 
 def _config_cure(config: object) -> str:
@@ -241,51 +240,3 @@ def _config_cure(config: object) -> str:
     if isinstance(config, (str, PurePath)):
         return f'pass config=load_config("{config}")'
     return 'pass config=load_config("fast"), or config_from_mapping(RefinerConfig, ...) of nested keys'
-
-
-def _assembled(
-    prior: ShapePrior,
-    frames: FrameBatch,
-    detections: Detections,
-    state: CarState,
-    status: Tensor,
-    rows: Tensor,
-    outcome: Outcome,
-) -> RefinementResult:
-    """The result of a call whose cars `rows` were minimised; the others keep what they came with."""
-    of_all = outcome.spread(rows, len(detections))
-    refined = is_refined(status)
-    returned_input = (status == Status.not_trusted.code) | (status == Status.no_evidence.code)
-    figures_known = refined | returned_input
-    # The input pose is returned to the bit for cars that were not refined, not inverted twice.
-    T_cam_obj = torch.where(refined[:, None, None], se3.inverse(state.T_obj_cam), detections.T_cam_obj)
-    return RefinementResult(
-        T_cam_obj=T_cam_obj,
-        code=state.code,
-        status_code=status,
-        iterations=of_all.iterations.clamp_min(0),
-        term_names=outcome.term_names,
-        cost_before=of_all.cost_before,
-        cost_after=of_all.cost_after,
-        covariance=kept(of_all.covariance, refined),
-        covariance_xyz_yaw=kept(of_all.covariance_xyz_yaw, refined),
-        cost_history=of_all.cost_history,
-        quality=of_all.quality.where(figures_known),
-        observability=of_all.observability.where(refined),
-        profile=of_all.profile.where(figures_known),
-        # The caller may reuse the tensor for the next call.
-        input_dimensions_hwl=detections.dimensions_hwl.clone(),
-        ground_source=_ground_sources(frames, detections),
-        t_cam_ref=frames.camera.t_cam_ref[detections.frame_index],
-        track_part=of_all.track_part,
-        prior=prior,
-        has_shape=outcome.has_shape,
-    )
-
-
-def _ground_sources(frames: FrameBatch, detections: Detections) -> tuple[str, ...]:
-    """Where the plane of each car's frame came from; which frame that is the host asks only where it matters."""
-    sources = frames.ground.source
-    if len(set(sources)) == 1:
-        return sources[:1] * len(detections)
-    return tuple(sources[frame] for frame in detections.frame_index.tolist())

@@ -27,9 +27,7 @@ from torch import Tensor
 
 from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.errors import InputError
-from directshape_torch.refinement import outcome as outcomes
-from directshape_torch.refinement import tracks
-from directshape_torch.refinement.outcome import Outcome
+from directshape_torch.refinement import outcome, tracks
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.quality import EVIDENCE_NAMES
 from directshape_torch.refinement.result import RefinementResult
@@ -185,12 +183,12 @@ def test_a_view_that_is_not_trusted_by_itself_does_not_join() -> None:
 def doubt_in_track(monkeypatch: pytest.MonkeyPatch, row: int) -> None:
     """Have one view trusted by itself and not in its track."""
 
-    def judged(minimum: Minimum[CarState], *others: Any) -> Outcome:
-        outcome = outcomes.judged(minimum, *others)
+    def judged(*args: Any) -> tuple[Minimum[CarState], RefinementResult]:
+        minimum, found = outcome.judged(*args)
         if not isinstance(minimum.stage.problem.sharing, Groups):
-            return outcome
-        doubted = torch.arange(len(outcome.status)) == row
-        return replace(outcome, status=torch.where(doubted, Status.not_trusted.code, outcome.status))
+            return minimum, found
+        status = minimum.status.index_fill(0, torch.tensor([row]), Status.not_trusted.code)
+        return replace(minimum, status=status), replace(found, status_code=status)
 
     monkeypatch.setattr(tracks, "judged", judged)
 

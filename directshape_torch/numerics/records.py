@@ -46,6 +46,13 @@ class Record:
     # Fields that are one for all rows: kept where rows are chosen.
     shared: ClassVar[frozenset[str]] = frozenset()
 
+    @classmethod
+    @cache
+    def _hints(cls) -> dict[str, Any]:
+        """The types of the fields by name, with what is said of tensors."""
+        hints = get_type_hints(cls, include_extras=True)
+        return {each.name: hints[each.name] for each in fields(cls)}  # type: ignore[arg-type]
+
     def to(self, device: torch.device | torch.dtype | str | None = None, dtype: torch.dtype | None = None) -> Self:
         """A copy on another device and, for floating-point tensors, of another dtype, which may come alone."""
         if isinstance(device, torch.dtype):
@@ -102,11 +109,10 @@ class TensorRecord(Record):
     @cache
     def _declared(cls) -> dict[str, tuple[Dense, bool]]:
         """The tensors by name: what they must be, and whether None will do."""
-        hints = get_type_hints(cls, include_extras=True)
         return {
             each.name: (spec, each.default is None)
             for each in fields(cls)  # type: ignore[arg-type]
-            for spec in getattr(hints[each.name], "__metadata__", ())
+            for spec in getattr(cls._hints()[each.name], "__metadata__", ())
             if isinstance(spec, Dense)
         }
 
@@ -124,19 +130,40 @@ class TensorRecord(Record):
 class CarRecord(Record):
     """Base of records of tensors (B, ...), one row a car, of such records, and of words and other values."""
 
-    def spread(self, rows: Tensor, count: int) -> Self:
-        """The cars `rows` (B,), ascending, placed among `count` cars; NaN for the others."""
-        return self._with(lambda value: placed(value, rows, count), by_row=True)
+    @classmethod
+    def nothing(cls, sizes: Mapping[int | str, int], like: Tensor, **known: Any) -> Self:
+        """A record of which nothing is known but some fields: NaN, and -1 for whole numbers, on the device of `like`.
+
+        Args:
+            sizes: of the letters of all shapes.
+            like: any tensor.
+            known: values of fields; those that have no default and are no tensors must be there.
+        """
+        values = dict(known)
+        for name, kind in cls._hints().items():
+            if name in known:
+                continue
+            if isinstance(kind, type) and issubclass(kind, CarRecord):
+                values[name] = kind.nothing(sizes, like)
+            elif hasattr(kind, "__metadata__"):
+                spec: Dense = kind.__metadata__[0]
+                shape = [sizes.get(size, size) for size in spec.shape]
+                unknown = -1 if spec.kind == "index" else torch.nan
+                dtype = torch.int64 if spec.kind == "index" else torch.float64
+                values[name] = torch.full(shape, unknown, dtype=dtype, device=like.device)  # type: ignore[arg-type]
+        return cls(**values)
 
     def where(self, condition: Tensor) -> Self:
         """A copy with NaN for the cars where the condition (B,) does not hold."""
         return self._with(lambda value: kept(value, condition), by_row=True)
 
     def put(self, rows: Tensor, others: Self) -> Self:
-        """A copy with the cars `rows` (R,) replaced; figures of another width stay as they are."""
+        """A copy with the cars `rows` (R,) replaced; where figures have another width the others have none: NaN."""
 
         def replaced(value: Tensor, other: Tensor) -> Tensor:
-            return value.index_copy(0, rows, other) if value.shape[1:] == other.shape[1:] else value
+            if value.shape[1:] != other.shape[1:]:
+                value = other.new_full((len(value), *other.shape[1:]), torch.nan)
+            return value.index_copy(0, rows, other)
 
         return self._with(replaced, others, by_row=True)
 
@@ -165,24 +192,23 @@ class CarRecord(Record):
             InputError: a value is missing or is not what its field declares.
         """
         values, sizes = dict(others), {} if sizes is None else sizes
-        hints = get_type_hints(cls, include_extras=True)
-        for each in fields(cls):  # type: ignore[arg-type]
-            kind, name = hints[each.name], prefix + each.name
+        for field, kind in cls._hints().items():
+            name = prefix + field
             called = f"state[{name!r}]"
-            if each.name in others:
+            if field in others:
                 continue
             if isinstance(kind, type) and issubclass(kind, CarRecord):
-                values[each.name] = kind._from_state(state, f"{name}.", sizes)
+                values[field] = kind._from_state(state, f"{name}.", sizes)
             elif name not in state:
                 raise InputError("state", f"the tensor {name!r}", f"{len(state)} others", "save result.state_dict()")
             elif kind is bool:
                 check_shape(called, state[name], ())
-                values[each.name] = bool(state[name])
+                values[field] = bool(state[name])
             elif hasattr(kind, "__metadata__"):
                 kind.__metadata__[0].check(called, state[name], sizes)
-                values[each.name] = state[name]
+                values[field] = state[name]
             else:
-                values[each.name] = _words(called, state[name])
+                values[field] = _words(called, state[name])
         return cls(**values)
 
 
@@ -194,14 +220,6 @@ def _words(name: str, letters: Tensor) -> tuple[str, ...]:
     except (TypeError, ValueError) as error:  # numbers that are no bytes, bytes that are no letters
         raise InputError(name, "UTF-8 bytes", shown(letters.tolist()), "save result.state_dict()") from error
     return tuple(text.split("\n")) if text else ()
-
-
-def placed(values: Tensor, rows: Tensor, count: int) -> Tensor:
-    """Figures (R, ...) of the cars `rows` (R,), ascending, among `count` cars; NaN, of integers -1, for the others."""
-    if len(rows) == count:  # all of them, which is the usual case
-        return values
-    nothing = torch.nan if values.is_floating_point() else -1
-    return values.new_full((count, *values.shape[1:]), nothing).index_copy(0, rows, values)
 
 
 def kept(values: Tensor, condition: Tensor) -> Tensor:

@@ -21,8 +21,9 @@ from directshape_torch.refinement.disparity_profile import (
     profile_offsets,
     shifted_costs,
 )
-from directshape_torch.refinement.outcome import Outcome
+from directshape_torch.refinement.outcome import at_states
 from directshape_torch.refinement.problem import CarProblem
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.rows import CarSums, ObjectRays, Rays
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.status import Status
@@ -38,10 +39,11 @@ _TOP = -0.5
 
 
 @torch.no_grad()
-def align_boxes(problem: CarProblem, initial: CarState, cars: CarBatch) -> Outcome:
+def align_boxes(problem: CarProblem, initial: CarState, cars: CarBatch, came: RefinementResult) -> RefinementResult:
     """Move the detector's boxes of B cars along the viewing rays of their origins to the lowest photometric cost.
 
-    The status is `converged`, `no_evidence` where the cost has no valley in the last range, or `non_finite`.
+    `came` is what is known of the cars beforehand. The status is `converged`, `no_evidence` where the cost has no
+    valley in the last range, or `non_finite`.
     """
     state = initial
     for range_px, step_px in _ROUNDS_PX:
@@ -59,15 +61,16 @@ def align_boxes(problem: CarProblem, initial: CarState, cars: CarBatch) -> Outco
     at_input = term.where(problem.look(initial)._replace(hits=_near_sides(problem, initial, cars)))
     profile = disparity_profile(term, at_input, at_end, len(cars), state.code)
     before, after = (cost[:, None] for cost in profile.cost_at(0.0))
-    return replace(
-        Outcome.nothing(problem, where_rows(converged, state, initial)),
-        status=status,
+    result = replace(
+        came,
+        status_code=status,
         iterations=torch.full_like(status, len(_ROUNDS_PX)),
         cost_before=before,
         cost_after=after,
         profile=profile,
         has_shape=False,
     )
+    return at_states(result, where_rows(converged, state, initial))
 
 
 def box_hits(

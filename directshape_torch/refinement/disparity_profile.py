@@ -7,7 +7,7 @@ whole visible surface had another disparity; shape and contour stay.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
 
 import torch
@@ -70,13 +70,6 @@ class DisparityProfile(CarRecord):
     cost_before: Annotated[Tensor, Dense("B", "n")]
     cost_after: Annotated[Tensor, Dense("B", "n")]
     num_pixels: Annotated[Tensor, Dense("B")]
-
-    @classmethod
-    def nothing(cls, like: Tensor, count: int) -> DisparityProfile:
-        """Curves of `count` cars of which nothing is known: NaN."""
-        offsets = default_offsets(like)
-        nan = torch.full((count, len(offsets)), torch.nan, dtype=torch.float64, device=like.device)
-        return cls(offsets, nan, nan, nan[:, 0])
 
     @property
     def lowest(self) -> tuple[Tensor, Tensor]:
@@ -199,11 +192,11 @@ def disparity_profile(
     Offsets (n,) are evenly spaced, 0 among them; of each car's pixels every second, third, ... if it has too many.
     """
     offsets = default_offsets(like) if offsets_px is None else offsets_px
-    nan = torch.full((num_cars, len(offsets)), torch.nan, dtype=torch.float64, device=like.device)
+    nothing = DisparityProfile.nothing({"B": num_cars, "n": len(offsets)}, like, offsets_px=offsets)
     if term is None or before is None or after is None:
-        return DisparityProfile(offsets, nan, nan, nan[:, 0])
+        return nothing
     if not len(term.blocks.owner):
-        return DisparityProfile(offsets, nan, nan, torch.zeros_like(nan[:, 0]))
+        return replace(nothing, num_pixels=torch.zeros_like(nothing.num_pixels))
     rows, place = _thinned(term, max_pixels)
     depth, on_surface = (
         torch.stack([x.flatten()[place], y.flatten()[place]])

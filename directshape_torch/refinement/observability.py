@@ -48,12 +48,6 @@ class Observability(CarRecord):
     directions: Annotated[Tensor, Dense("B", 7, 7)]
     viewing_angle_rad: Annotated[Tensor, Dense("B")]
 
-    @classmethod
-    def nothing(cls, like: Tensor, count: int) -> Observability:
-        """Directions of `count` cars of which nothing is known: NaN."""
-        nan = torch.full((count,), torch.nan, dtype=torch.float64, device=like.device)
-        return cls(nan[:, None].expand(-1, 7), nan[:, None, None].expand(-1, 7, 7), nan)
-
     def scaled(self, factor: float) -> Observability:
         """The same directions with all standard deviations multiplied by a factor."""
         return Observability(factor * self.sigmas_m, self.directions, self.viewing_angle_rad)
@@ -147,7 +141,7 @@ def observability_of(prior: ShapePrior, state: CarState, seen: Tensor | None) ->
     T_cam_obj = se3.inverse(state.T_obj_cam)
     alpha = alpha_from_kitti(T_cam_obj[:, :3, 3], rotation_y_from_pose(T_cam_obj)).to(torch.float64)
     if seen is None:
-        return Observability.nothing(alpha, len(alpha))
+        return Observability.nothing({"B": len(alpha)}, alpha)
     sigmas, directions = _principal(seen, quantities_jacobian(prior, state))
     return Observability(sigmas, directions, alpha)
 

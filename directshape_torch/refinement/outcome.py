@@ -1,30 +1,38 @@
-"""What a minimisation says of its cars, and the result of a call that it becomes a part of."""
+"""How the result of a call is made: cars as they came, what a minimisation says of them, and whether to believe it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.geometry import se3
-from directshape_torch.numerics.records import CarRecord, placed
-from directshape_torch.refinement.disparity_profile import DisparityProfile, disparity_profile
+from directshape_torch.numerics.records import kept
+from directshape_torch.refinement.disparity_profile import DisparityProfile, default_offsets, disparity_profile
 from directshape_torch.refinement.observability import (
-    Observability,
     covariance_of,
     covariance_xyz_yaw,
     observability_of,
     without_offset,
 )
 from directshape_torch.refinement.problem import CarProblem, CarStage
-from directshape_torch.refinement.quality import Course, FitQuality, bundled_trust_model, fit_quality
+from directshape_torch.refinement.quality import (
+    EVIDENCE_NAMES,
+    bundled_trust_model,
+    evidence_of_costs,
+    evidence_of_motion,
+    fit_quality,
+)
+from directshape_torch.refinement.result import RefinementResult
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.status import Status, is_refined
 from directshape_torch.terms.cars import CarBatch, CarState
-from directshape_torch.terms.priors import RIG_WEIGHT, detector_pose_sigma
+from directshape_torch.terms.priors import RIG_WEIGHT
 from directshape_torch.terms.term import Evaluation, Figures
 
 # Nine in ten cars whose cost settled promise less than this share of it.
@@ -37,67 +45,78 @@ _LEAST_MATCHED_SHARE = 0.1
 _LARGEST_DEPTH_SHARE = 0.2
 
 
-@dataclass(frozen=True)
-class Outcome(CarRecord):
-    """What is said of the R cars that could be refined; fields as in `RefinementResult`."""
-
-    state: CarState
-    status: Tensor
-    iterations: Tensor
-    cost_history: Tensor
-    term_names: tuple[str, ...]
-    cost_before: Tensor
-    cost_after: Tensor
-    covariance: Tensor
-    covariance_xyz_yaw: Tensor
-    quality: FitQuality
-    observability: Observability
-    profile: DisparityProfile
-    track_part: Tensor
-    has_shape: bool = True
-
-    @classmethod
-    def nothing(cls, problem: CarProblem, state: CarState) -> Outcome:
-        """The outcome of B cars of which nothing is known but their state."""
-        count, unknowns = len(state.code), 6 + state.code.shape[1]
-        nan = torch.full((count,), torch.nan, dtype=torch.float64, device=state.code.device)
-        none = torch.zeros_like(nan, dtype=torch.long)
-        names = problem.term_names
-        return cls(
-            state=state,
-            status=none,
-            iterations=none,
-            cost_history=nan[:, None][:, :0],
-            term_names=names,
-            cost_before=nan[:, None].expand(-1, len(names)),
-            cost_after=nan[:, None].expand(-1, len(names)),
-            covariance=nan[:, None, None].expand(-1, unknowns, unknowns),
-            covariance_xyz_yaw=nan[:, None, None].expand(-1, 4, 4),
-            quality=FitQuality.nothing(nan, count),
-            observability=Observability.nothing(nan, count),
-            profile=DisparityProfile.nothing(nan, count),
-            track_part=none - 1,
-        )
-
-    def with_columns(self, names: tuple[str, ...]) -> Outcome:
-        """With costs in the columns of these names, 0 in those that it has not."""
-        place = torch.tensor([names.index(name) for name in self.term_names], device=self.status.device)
-
-        def placed_in(costs: Tensor) -> Tensor:
-            return costs.new_zeros(len(costs), len(names)).index_copy(1, place, costs)
-
-        before, after = placed_in(self.cost_before), placed_in(self.cost_after)
-        return replace(self, term_names=names, cost_before=before, cost_after=after)
-
-    def going_on(self, rows: Tensor, later: Outcome) -> Outcome:
-        """The outcome with the figures of a later minimisation of the cars `rows` (R,), ascending; the state stays."""
-        done = self.iterations.index_add(0, rows, later.iterations)
-        history = torch.cat([self.cost_history, placed(later.cost_history, rows, len(self.status))], dim=1)
-        return replace(self.put(rows, later), iterations=done, cost_history=history)
+def as_they_came(
+    prior: ShapePrior, frames: FrameBatch, detections: Detections, status_code: Tensor, term_names: tuple[str, ...]
+) -> RefinementResult:
+    """The result of B cars of which nothing is known but what they came with, and the statuses (B,) that say so."""
+    count, T_cam_obj = len(detections), detections.T_cam_obj.clone()
+    offsets = default_offsets(T_cam_obj)
+    sizes: dict[int | str, int] = {"B": count, "D": 6 + prior.num_codes, "T": len(term_names), "iterations": 0}
+    sizes |= {"E": len(EVIDENCE_NAMES), "n": len(offsets)}
+    return RefinementResult.nothing(
+        sizes,
+        T_cam_obj,
+        T_cam_obj=T_cam_obj,
+        code=prior.initial_code(count).to(T_cam_obj),
+        status_code=status_code,
+        iterations=torch.zeros_like(status_code),
+        term_names=term_names,
+        profile=DisparityProfile.nothing(sizes, T_cam_obj, offsets_px=offsets),
+        # The caller may reuse the tensor for the next call.
+        input_dimensions_hwl=detections.dimensions_hwl.clone(),
+        ground_source=_ground_sources(frames, detections),
+        t_cam_ref=frames.camera.t_cam_ref[detections.frame_index],
+        prior=prior,
+    )
 
 
-def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState], cars: CarBatch) -> Outcome:
-    """Costs, covariance, quality, observability and profile of the cars of a problem at its minimum.
+def _ground_sources(frames: FrameBatch, detections: Detections) -> tuple[str, ...]:
+    """Where the plane of each car's frame came from; which frame that is the host asks only where it matters."""
+    sources = frames.ground.source
+    if len(set(sources)) == 1:
+        return sources[:1] * len(detections)
+    return tuple(sources[frame] for frame in detections.frame_index.tolist())
+
+
+def going_on(result: RefinementResult, rows: Tensor, later: RefinementResult) -> RefinementResult:
+    """The result with what a later minimisation says of the cars `rows` (R,), ascending.
+
+    Terms that the earlier one did not have have cost the others nothing.
+    """
+    place = torch.tensor([later.term_names.index(name) for name in result.term_names], device=rows.device)
+    before, after = (
+        costs.new_zeros(len(result), len(later.term_names)).index_copy(1, place, costs)
+        for costs in (result.cost_before, result.cost_after)
+    )
+    history = later.cost_history.new_full((len(result), later.cost_history.shape[1]), torch.nan)
+    history = torch.cat([result.cost_history, history.index_copy(0, rows, later.cost_history)], dim=1)
+    done = result.iterations.index_add(0, rows, later.iterations)
+    result = replace(result, term_names=later.term_names, cost_before=before, cost_after=after).put(rows, later)
+    return replace(result, iterations=done, cost_history=history)
+
+
+def at_states(result: RefinementResult, state: CarState) -> RefinementResult:
+    """The result at its final states; what is said of a car that is not there is not known."""
+    status, refined = result.status_code, result.refined
+    figures_known = refined | (status == Status.not_trusted.code) | (status == Status.no_evidence.code)
+    # The input pose is returned to the bit for cars that were not refined, not inverted twice.
+    T_cam_obj = torch.where(refined[:, None, None], se3.inverse(state.T_obj_cam), result.T_cam_obj)
+    return replace(
+        result,
+        T_cam_obj=T_cam_obj,
+        code=state.code,
+        covariance=kept(result.covariance, refined),
+        covariance_xyz_yaw=kept(result.covariance_xyz_yaw, refined),
+        quality=result.quality.where(figures_known),
+        observability=result.observability.where(refined),
+        profile=result.profile.where(figures_known),
+    )
+
+
+def outcome_of(
+    problem: CarProblem, initial: CarState, minimum: Minimum[CarState], cars: CarBatch, came: RefinementResult
+) -> RefinementResult:
+    """What `came` becomes at a minimum: costs, covariance, quality, observability and profile.
 
     All of them where the iterations ended; cars that the solver gave their input back show nothing of it in a result
     but their costs.
@@ -110,40 +129,26 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
     information = problem.sharing.with_others(after.information.sum(dim=1), refined)
     covariance = covariance_of(information)[:, :num_kept, :num_kept] + _of_field(end, cars)
     at_input, at_end = (None if at is None else at.where for at in map(stage.photometric_part, (before, after)))
-    course = Course(
-        stage=stage,
-        before=initial,
-        after=end,
-        detector_hwl=cars.detector_hwl,
-        cost_before=before.term_costs,
-        cost_after=torch.where(refined[:, None], after.term_costs, before.term_costs),
-        figures=after,
-        seen=minimum.seen_end,
-        covariance=covariance,
-        covariance_xyz_yaw=covariance_xyz_yaw(covariance, end.T_obj_cam),
-        profile=disparity_profile(stage.photometric, at_input, at_end, len(cars), end.code),
-        detector_sigma=detector_pose_sigma(problem.config.priors, cars)[:, 0].detach(),
-    )
     seen = stage.information_of_measurements(after)
     if seen is not None:
         seen = without_offset(problem.sharing.with_others(seen, refined), num_kept)
-    unseen = observability_of(problem.prior, end, seen)
-    return Outcome(
-        state=minimum.state,
-        status=minimum.status,
+    found = replace(
+        came,
+        status_code=minimum.status,
         iterations=minimum.iterations,
         cost_history=minimum.cost_history,
         term_names=problem.term_names,
-        cost_before=course.cost_before,
-        cost_after=course.cost_after,
+        cost_before=before.term_costs,
+        cost_after=torch.where(refined[:, None], after.term_costs, before.term_costs),
         covariance=covariance,
-        covariance_xyz_yaw=course.covariance_xyz_yaw,
-        quality=fit_quality(course),
+        covariance_xyz_yaw=covariance_xyz_yaw(covariance, end.T_obj_cam),
         # The directions are mostly those of the depth, so its factor brings them to size.
-        observability=unseen.scaled(bundled_trust_model().sigma_factors[0]),
-        profile=course.profile,
-        track_part=torch.full_like(minimum.status, -1),
+        observability=observability_of(problem.prior, end, seen).scaled(bundled_trust_model().sigma_factors[0]),
+        profile=disparity_profile(stage.photometric, at_input, at_end, len(cars), end.code),
     )
+    evidence = evidence_of_motion(problem, cars, initial, end, covariance, found.covariance_xyz_yaw)
+    evidence |= evidence_of_costs(found.cost_before, found.cost_after, found.profile)
+    return replace(found, quality=fit_quality(stage, after, minimum.seen_end, evidence))
 
 
 def _of_field(end: CarState, cars: CarBatch) -> Tensor:
@@ -166,28 +171,29 @@ def _of_calibrated_rig(problem: CarProblem, figures: Figures) -> Figures:
     return figures._replace(information=figures.information * factor[..., None, None])
 
 
-def judged(minimum: Minimum[CarState], initial: CarState, outcome: Outcome, limits: AcceptanceConfig) -> Outcome:
-    """The outcome with the statuses that the figures give, and the input's state for cars that they speak against.
+def judged(
+    minimum: Minimum[CarState], initial: CarState, found: RefinementResult, limits: AcceptanceConfig
+) -> tuple[Minimum[CarState], RefinementResult]:
+    """Both with the statuses that the figures give, the minimum with the input of cars that they speak against.
 
     A probability that is not known is no reason to return the input, evidence that is missing is one.
     """
-    status, end = minimum.status, minimum.end
+    status = minimum.status
     # The iterations may run out where there is nothing left to gain.
     settled = (status == Status.max_iterations.code) & (promised_decrease(minimum) < _SETTLED_SHARE)
     status = torch.where(settled, Status.converged.code, status)
-    unseen = is_refined(status) & ~has_evidence(end, outcome)
+    unseen = is_refined(status) & ~has_evidence(minimum.end, found)
     status = torch.where(unseen, Status.no_evidence.code, status)
     # What the model of trust has learnt does not hold where there is nothing to see.
-    quality = replace(
-        outcome.quality,
-        probability_better=outcome.quality.probability_better.masked_fill(unseen, torch.nan),
-        probability_not_worse=outcome.quality.probability_not_worse.masked_fill(unseen, torch.nan),
+    better, not_worse = (
+        probability.masked_fill(unseen, torch.nan)
+        for probability in (found.quality.probability_better, found.quality.probability_not_worse)
     )
-    doubtful = quality.probability_better < limits.min_probability_better
-    risky = quality.probability_not_worse < limits.min_probability_not_worse
+    doubtful, risky = better < limits.min_probability_better, not_worse < limits.min_probability_not_worse
     status = torch.where(is_refined(status) & (doubtful | risky), Status.not_trusted.code, status)
     state = where_rows(is_refined(status), minimum.state, initial)
-    return replace(outcome, status=status, state=state, quality=quality)
+    quality = replace(found.quality, probability_better=better, probability_not_worse=not_worse)
+    return replace(minimum, state=state, status=status), replace(found, status_code=status, quality=quality)
 
 
 def promised_decrease(minimum: Minimum[CarState]) -> Tensor:
@@ -201,16 +207,16 @@ def promised_decrease(minimum: Minimum[CarState]) -> Tensor:
     return torch.where(solvable, promised, torch.inf)
 
 
-def has_evidence(end: CarState, outcome: Outcome) -> Tensor:
+def has_evidence(end: CarState, found: RefinementResult) -> Tensor:
     """Whether the images confirm the states (B,) at the end: masks, compared pixels, a depth that is known."""
-    quality, location = outcome.quality, se3.inverse(end.T_obj_cam)[:, :3, 3]
+    quality, location = found.quality, se3.inverse(end.T_obj_cam)[:, :3, 3]
     left = quality.mask_iou_left
     iou = torch.where(left.isnan(), quality.mask_iou_right, left)
-    depth_share = _sigma_along(outcome.covariance_xyz_yaw, location) / location[:, 2]
+    depth_share = _sigma_along(found.covariance_xyz_yaw, location) / location[:, 2]
     seen = depth_share < _LARGEST_DEPTH_SHARE  # a comparison with NaN is false
-    if "silhouette_left" in outcome.term_names:
+    if "silhouette_left" in found.term_names:
         seen = seen & (iou >= _LEAST_MASK_IOU)
-    if "photometric" in outcome.term_names:
+    if "photometric" in found.term_names:
         # Its pixels are those of the left mask.
         seen = seen & ((quality.matched_share >= _LEAST_MATCHED_SHARE) | left.isnan())
     return seen

@@ -17,18 +17,17 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from directshape_torch.errors import DataFormatError
-from directshape_torch.files.read_files import read_json
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import rotation_y_from_pose, viewing_axes, wrap_angle
 from directshape_torch.numerics.records import CarRecord, Dense
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.refinement.disparity_profile import DisparityProfile
-from directshape_torch.refinement.problem import CarStage
+from directshape_torch.refinement.problem import CarProblem, CarStage
 from directshape_torch.rows import CarSums
 from directshape_torch.shape.shape_prior import DimensionsDerivative
-from directshape_torch.terms.cars import CarState
+from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.photometric import Photometric
+from directshape_torch.terms.priors import detector_pose_sigma
 from directshape_torch.terms.silhouette import MaskRows
 from directshape_torch.terms.term import Figures, Part, Sight
 
@@ -87,12 +86,6 @@ class FitQuality(CarRecord):
     probability_better: Annotated[Tensor, Dense("B")]
     probability_not_worse: Annotated[Tensor, Dense("B")]
 
-    @classmethod
-    def nothing(cls, like: Tensor, count: int) -> FitQuality:
-        """No figures for `count` cars."""
-        nan = torch.full((count,), torch.nan, dtype=torch.float64, device=like.device)
-        return cls(nan, nan, nan, nan, nan[:, None].expand(-1, len(EVIDENCE_NAMES)), nan, nan)
-
 
 @dataclass(frozen=True)
 class LogisticHead:
@@ -150,70 +143,46 @@ class TrustModel:
         Path(path).write_text(text + "\n", encoding="utf-8")
 
 
-def load_trust_model(path: Path | str) -> TrustModel:
-    """Read a file of `TrustModel.save`.
+def trust_model_of(content: Mapping[str, Any]) -> TrustModel:
+    """The model that `TrustModel.save` has written.
 
     Raises:
-        DataFormatError: it is no such file, or of another schema version.
+        ValueError: it is that of another version.
     """
-    cure = "write it with scripts/calibrate_quality.py"
-    content = read_json(path, cure)
-    try:
-        if content["schema"] != SCHEMA:
-            raise ValueError(f"schema {content['schema']!r}, this version reads {SCHEMA!r}")
-        better, not_worse = (_head(content[name]) for name in ("better", "not_worse"))
-        factors, floors = (tuple(map(float, content[name])) for name in ("sigma_factors", "sigma_floors"))
-        if unknown := {*better.columns, *not_worse.columns} - set(EVIDENCE_NAMES):
-            raise ValueError(f"unknown columns {sorted(unknown)}")
-        if len(factors) != 4 or len(floors) != 4:
-            raise ValueError(f"{len(factors)} factors and {len(floors)} floors of sigmas, not 4")
-        return TrustModel(better, not_worse, factors, floors, content["provenance"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataFormatError(path, f"is no model of trust ({error})", cure=cure) from error
+    if content["schema"] != SCHEMA:
+        raise ValueError(f"schema {content['schema']!r}, this version reads {SCHEMA!r}")
+    heads = []
+    for head in (content["better"], content["not_worse"]):
+        columns, means, scales, weights = (tuple(head[name]) for name in ("columns", "means", "scales", "weights"))
+        heads.append(LogisticHead(columns, means, scales, weights, head["bias"]))
+    factors, floors = (tuple(content[name]) for name in ("sigma_factors", "sigma_floors"))
+    better, not_worse = heads
+    return TrustModel(better, not_worse, factors, floors, content["provenance"])
 
 
 @cache
 def bundled_trust_model() -> TrustModel:
     """The model that comes with the package; read at its first use."""
-    return load_trust_model(BUNDLED)
-
-
-def _head(content: Mapping[str, Any]) -> LogisticHead:
-    columns, numbers = tuple(content["columns"]), ("means", "scales", "weights")
-    values = {name: tuple(map(float, content[name])) for name in numbers}
-    if any(len(value) != len(columns) for value in values.values()):
-        raise ValueError(f"{len(columns)} columns need as many {', '.join(numbers)}")
-    return LogisticHead(columns, **values, bias=float(content["bias"]))
-
-
-@dataclass(frozen=True)
-class Course:
-    """The course of a refinement of B cars, as far as the evidence needs it."""
-
-    stage: CarStage  # the last one
-    before: CarState  # input
-    after: CarState  # final state
-    detector_hwl: Tensor  # (B, 3) metres, of the input
-    cost_before: Tensor  # (B, T) of the input, at the final stage
-    cost_after: Tensor  # (B, T) of the final state
-    figures: Figures  # of the energy at the final state
-    seen: Sight  # what the rays see there
-    covariance: Tensor  # (B, D, D) in the tangent of `retract`, uncalibrated
-    covariance_xyz_yaw: Tensor  # (B, 4, 4), uncalibrated
-    profile: DisparityProfile  # photometric cost over the disparity
-    detector_sigma: Tensor  # (B,) metres, of the input along the viewing ray; not finite where nobody knows it
+    return trust_model_of(json.loads(BUNDLED.read_text(encoding="utf-8")))
 
 
 @torch.no_grad()
-def fit_quality(course: Course) -> FitQuality:
-    """Figures of B cars at the end of a refinement."""
-    stage = course.stage
-    left, right = mask_ious(stage.problem.masks, course.seen)
+def fit_quality(stage: CarStage, figures: Figures, seen: Sight, evidence: Mapping[str, Tensor]) -> FitQuality:
+    """Figures of B cars at the end of a refinement.
+
+    Args:
+        stage: the last one.
+        figures: of the energy at the final states.
+        seen: what the rays see there.
+        evidence: columns (B,) of `EVIDENCE_NAMES`, but that of the masks.
+    """
+    left, right = mask_ious(stage.problem.masks, seen)
     nan = torch.full_like(left, torch.nan)
-    photometric, at = stage.photometric, stage.photometric_part(course.figures)
+    photometric, at = stage.photometric, stage.photometric_part(figures)
     both = (nan, nan) if photometric is None or at is None else photometric_agreement(photometric, at)
-    evidence = evidence_of(course, left)
-    return FitQuality(left, right, *both, evidence, *_probabilities(stage.problem.term_names, evidence))
+    columns = {**evidence, "mask_misfit_left": 1 - left}
+    table = torch.stack([columns[name].to(torch.float64) for name in EVIDENCE_NAMES], dim=1)
+    return FitQuality(left, right, *both, table, *_probabilities(stage.problem.term_names, table))
 
 
 def _probabilities(term_names: Sequence[str], evidence: Tensor) -> tuple[Tensor, Tensor]:
@@ -250,43 +219,40 @@ def photometric_agreement(term: Photometric, at: Part) -> tuple[Tensor, Tensor]:
     return torch.where(total > 0, error / total.clamp_min(1), nothing), share
 
 
-def evidence_of(course: Course, mask_iou_left: Tensor) -> Tensor:
-    """The evidence (B, E), float64, columns `EVIDENCE_NAMES`; NaN where a figure does not exist."""
-    columns = _motion(course) | _costs(course) | {"mask_misfit_left": 1 - mask_iou_left}
-    return torch.stack([columns[name].to(torch.float64) for name in EVIDENCE_NAMES], dim=1)
-
-
-def _motion(course: Course) -> dict[str, Tensor]:
+def evidence_of_motion(
+    problem: CarProblem,
+    cars: CarBatch,
+    before: CarState,
+    after: CarState,
+    covariance: Tensor,  # (B, D, D) in the tangent of `retract`, uncalibrated
+    covariance_xyz_yaw: Tensor,  # (B, 4, 4), uncalibrated
+) -> dict[str, Tensor]:
     """How far the box was turned, and what the motion is worth in shares of itself."""
-    T_obj_cam = torch.stack([course.before.T_obj_cam, course.after.T_obj_cam]).to(torch.float64)
-    T_cam_obj = se3.inverse(T_obj_cam)
-    T_before, T_after = T_cam_obj
-    dimensions = course.stage.problem.prior.dimensions_and_derivative(course.after.code)
+    T_before, T_after = (se3.inverse(state.T_obj_cam.to(torch.float64)) for state in (before, after))
+    dimensions = problem.prior.dimensions_and_derivative(after.code)
     hwl = dimensions.hwl.to(torch.float64)
-    heading_before, heading_after = rotation_y_from_pose(T_cam_obj)
-    turned = wrap_angle(heading_after - heading_before)
+    turned = wrap_angle(rotation_y_from_pose(T_after) - rotation_y_from_pose(T_before))
     shift_cam = T_after[:, :3, 3] - T_before[:, :3, 3]
     shift_obj = (shift_cam[:, None] @ T_after[:, :3, :3])[:, 0]
-    change_wl = (hwl - course.detector_hwl)[:, 1:]
+    change_wl = (hwl - cars.detector_hwl)[:, 1:]
     motion = torch.cat([shift_obj[:, 0::2], turned[:, None], change_wl.flip(1)], dim=1)
-    gain = _expected_gain(motion, _footprint_sigmas(course, dimensions), hwl)
+    gain = _expected_gain(motion, _footprint_sigmas(covariance, dimensions), hwl)
     # A share of the depth; NaN where nobody knows it.
-    sigma, depth = course.detector_sigma, T_before[:, 2, 3]
+    sigma, depth = detector_pose_sigma(problem.config.priors, cars)[:, 0], T_before[:, 2, 3]
     is_known = sigma.isfinite() & (sigma > 0)
     return {
-        "log_sigma_yaw": 0.5 * course.covariance_xyz_yaw[:, 3, 3].clamp_min(_TINY**2).log(),
+        "log_sigma_yaw": 0.5 * covariance_xyz_yaw[:, 3, 3].clamp_min(_TINY**2).log(),
         "log_expected_gain": (gain + 0.005).log(),
         "turned": turned.abs(),
         "log_detector_sigma": torch.where(is_known, (sigma.to(depth) / depth.clamp_min(1.0)).log(), torch.nan),
     }
 
 
-def _footprint_sigmas(course: Course, dimensions: DimensionsDerivative) -> Tensor:
+def _footprint_sigmas(covariance: Tensor, dimensions: DimensionsDerivative) -> Tensor:
     """Standard deviations (B, 5) along and across the car, of its heading, length and width, of the right size."""
     J = dimensions.J_hwl_code[:, 1:].flip(1).to(torch.float64)
-    C = course.covariance
-    size_variance = (J @ C[:, 6:, 6:] * J).sum(dim=2)
-    variance = torch.cat([C.diagonal(dim1=1, dim2=2)[:, 0:6:2], size_variance], dim=1)
+    size_variance = (J @ covariance[:, 6:, 6:] * J).sum(dim=2)
+    variance = torch.cat([covariance.diagonal(dim1=1, dim2=2)[:, 0:6:2], size_variance], dim=1)
     return (variance * _SIGMA_FACTOR**2 + constant_like(_SIGMA_FLOORS, variance).square()).sqrt()
 
 
@@ -308,12 +274,13 @@ def _expected_gain(motion: Tensor, sigma: Tensor, hwl: Tensor) -> Tensor:
     return (loss * (at_input - at_output)).sum(1).clamp_min(0)
 
 
-def _costs(course: Course) -> dict[str, Tensor]:
+def evidence_of_costs(
+    cost_before: Tensor,  # (B, T) of the input, at the final stage
+    cost_after: Tensor,  # (B, T) of the final state
+    profile: DisparityProfile,
+) -> dict[str, Tensor]:
     """What the energy fell by, how sharply the images know the disparity, and how far they pulled the input."""
-    # (2, B): before and after.
-    paid = torch.stack([course.cost_before, course.cost_after]).permute(2, 0, 1).sum(dim=0)
-    log_before, log_after = paid.clamp_min(_TINY).log()
-    profile = course.profile
+    log_before, log_after = (cost.sum(dim=1).clamp_min(_TINY).log() for cost in (cost_before, cost_after))
     lowest_before, lowest_after = profile.lowest
     to_the_sides = torch.minimum(*(profile.cost_at(offset_px)[1] for offset_px in (-1.0, 1.0)))
     return {

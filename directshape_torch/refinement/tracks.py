@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from directshape_torch.refinement.outcome import Outcome, judged, outcome_of
+from directshape_torch.refinement.outcome import at_states, going_on, judged, outcome_of
 from directshape_torch.refinement.problem import CarProblem
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.gauss_newton import Minimum, minimise
 from directshape_torch.solver.problem import put_rows, take_rows
@@ -31,27 +32,30 @@ _MOST_SAVED = 9.0
 _MORE_ITERATIONS = 2
 
 
-def refined(problem: CarProblem, cars: CarBatch, initial: CarState, start: CarState) -> Outcome:
-    """The outcome of B cars, with the graph of the backward mode.
+def refined(
+    problem: CarProblem, cars: CarBatch, initial: CarState, start: CarState, came: RefinementResult
+) -> RefinementResult:
+    """The result of B cars, with the graph of the backward mode.
 
     Args:
         problem: of these cars, each by itself.
         cars: their tracks.
         initial: input states.
         start: where the iterations begin, made of the input states by `search_start`.
+        came: what is known of the cars beforehand.
     """
     unroll = torch.is_grad_enabled() and problem.config.backward.mode == "unroll"
-    minimum, outcome = _judged(problem, cars, initial, start, unroll)
+    minimum, found = _judged(problem, cars, initial, start, came)
     origin = following(initial, start) if unroll else start
     joins = is_refined(minimum.status)
     while True:
         shared = together(problem, cars, minimum, joins)
         if shared is None:
-            return replace(outcome, state=_attached(problem, cars, origin, minimum))
+            return at_states(found, _attached(problem, cars, origin, minimum))
         views, rows = cars.of_cars(shared.keep), shared.keep.nonzero()[:, 0]
         agreed = shared.agreed(take_rows(minimum.state, rows))
         before = shared.linked(take_rows(initial, rows))
-        in_track, of_track = _judged(shared.problem, views, before, agreed, unroll)
+        in_track, of_track = _judged(shared.problem, views, before, agreed, came.rows(rows))
         left = (in_track.status == Status.singular.code) | (in_track.status == Status.non_finite.code)
         if not bool(left.any()):
             break
@@ -65,20 +69,21 @@ def refined(problem: CarProblem, cars: CarBatch, initial: CarState, start: CarSt
     alone = _attached(problem, cars, origin, minimum)
     of_views = _attached(shared.problem, views, shared.agreed(take_rows(alone, rows)), _of_all_members(in_track))
     of_track = replace(of_track, track_part=shared.part_of(in_track.status))
-    outcome = outcome.with_columns(of_track.term_names).going_on(rows[chosen], of_track.rows(chosen))
+    found = going_on(found, rows[chosen], of_track.rows(chosen))
     # Path and neighbours have done their work.
     of_views = of_views._replace(path=of_views.path[:, :0], T_obj_next=of_views.T_obj_next[:, :0])
-    return replace(outcome, state=put_rows(alone, rows[chosen], take_rows(of_views, chosen)))
+    return at_states(found, put_rows(alone, rows[chosen], take_rows(of_views, chosen)))
 
 
-@torch.no_grad()
 def _judged(
-    problem: CarProblem, cars: CarBatch, initial: CarState, start: CarState, record: bool
-) -> tuple[Minimum[CarState], Outcome]:
-    """Where the iterations end, with the statuses that evidence and trust give, and what is said of it."""
-    minimum = minimise(problem, initial, problem.config.solver, start, record)
-    outcome = judged(minimum, initial, outcome_of(problem, initial, minimum, cars), problem.config.acceptance)
-    return replace(minimum, state=outcome.state, status=outcome.status), outcome
+    problem: CarProblem, cars: CarBatch, initial: CarState, start: CarState, came: RefinementResult
+) -> tuple[Minimum[CarState], RefinementResult]:
+    """Where the iterations end, and what is said of it, with the statuses that evidence and trust give."""
+    record = torch.is_grad_enabled() and problem.config.backward.mode == "unroll"
+    with torch.no_grad():
+        minimum = minimise(problem, initial, problem.config.solver, start, record)
+        found = outcome_of(problem, initial, minimum, cars, came)
+        return judged(minimum, initial, found, problem.config.acceptance)
 
 
 def _of_all_members(in_track: Minimum[CarState]) -> Minimum[CarState]:

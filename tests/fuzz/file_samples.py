@@ -37,7 +37,6 @@ from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.stereo_dataset import LayoutName, open_dataset
 from directshape_torch.io.velodyne import read_points, read_scan
-from directshape_torch.refinement.quality import load_trust_model
 from directshape_torch.report.make_report import make_report
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.rig_file import load_field, load_rigs, save_field, save_rigs
@@ -93,7 +92,7 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
     calibration.write_text((root / "training" / "calib" / f"{FRAME}.txt").read_text() + VELODYNE)
     np.linspace(-9, 9, 40, dtype="<f4").tofile(folder / "scan.bin")
     np.save(folder / "points.npy", np.linspace(-9, 9, 30).reshape(10, 3))
-    for name in ("neural_prior.safetensors", "trust_model.json", "configs/fast.yaml"):
+    for name in ("neural_prior.safetensors", "configs/fast.yaml"):
         shutil.copyfile(ASSETS / name, folder / Path(name).name)
     corners = "v 0 0 0\nv 4 0 0\nv 0 2 0\nv 0 0 2\n"
     (folder / "mesh.obj").write_text(f"{corners}f 1 2 3\nf 1 4 2\nf 2 4 3\nf 1 3 4\n")
@@ -125,7 +124,6 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
         "times": (folder / "times.txt", read_times),
         "poses": (folder / "poses.txt", read_poses),
         **{f"mesh {suffix[1:]}": (folder / f"mesh{suffix}", solid) for suffix in MESH_SUFFIXES},
-        "trust": (folder / "trust_model.json", load_trust_model),
         "settings": (folder / "fast.yaml", load_config),
     }
 

@@ -115,7 +115,7 @@ def test_broken_information_gives_nan_and_no_words() -> None:
 
 
 def test_no_cars_and_no_images() -> None:
-    assert Observability.nothing(torch.zeros(0), 0).words() == []
+    assert Observability.nothing({"B": 0}, torch.zeros(0)).words() == []
     prior = ellipsoid_prior()
     scene = street(prior, [(0.0, CAMERA_HEIGHT_M, 9.0)], [0.3])
     _, state = begun_stage(prior, scene.frames, scene.detections)

@@ -10,7 +10,7 @@ from helpers.problems import DEFAULT, begun_stage, figures_at, photometric_of
 from helpers.synthetic_scene import cached_street, disturbed
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.refinement.outcome import outcome_of
+from directshape_torch.refinement.outcome import as_they_came, outcome_of
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refinement.quality import mask_ious, photometric_agreement
 from directshape_torch.solver.gauss_newton import Minimum
@@ -96,7 +96,9 @@ def test_a_car_with_its_input_back_costs_after_what_it_cost_before() -> None:
         after=stage.figures(seen_end),
     )
     scene = cached_street()[1]
-    found = outcome_of(problem, initial, minimum, CarBatch.from_scene(scene.frames, disturbed(scene.detections)))
+    frames, detections = scene.frames, disturbed(scene.detections)
+    came = as_they_came(problem.prior, frames, detections, minimum.status, problem.term_names)
+    found = outcome_of(problem, initial, minimum, CarBatch.from_scene(frames, detections), came)
     at_end, at_input = (figures_at(stage, state).term_costs for state in (end, initial))
     assert torch.equal(found.cost_before, at_input)
     assert torch.equal(found.cost_after, torch.stack([at_input[0], at_end[1]]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from directshape_torch.cli.demo import demo_dataset
 from directshape_torch.errors import DataFormatError
 from directshape_torch.geometry.box3d import rotation_y_from_pose
 from directshape_torch.geometry.disparity_field import polynomial_basis
-from directshape_torch.refinement.quality import EVIDENCE_NAMES, load_trust_model
+from directshape_torch.refinement.quality import EVIDENCE_NAMES, trust_model_of
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.estimate import RigEstimate
 
@@ -157,7 +158,7 @@ def test_cars_that_are_kept_make_model_and_report(tmp_path: Path) -> None:
     arguments += ["--other", "kitti", "noisy", "m", "--out"]
     model = tmp_path / "model.json"
     assert calibrate_quality.main([*arguments, str(tmp_path / "out"), "--model", str(model)]) == 0
-    made = load_trust_model(model)
+    made = trust_model_of(json.loads(model.read_text()))
     assert (made.provenance["cars"], made.better.columns) == (480, calibrate_quality.BETTER)
     text = (tmp_path / "out" / "report.md").read_text()
     assert text.count("| rendered, all | ") == 5
