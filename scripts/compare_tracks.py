@@ -8,7 +8,7 @@
         --masks out/sequences/training/masks --out out/tracks
 
 Every sequence is cut into pieces of as many frames as `--views` says, each refined in one call; the first number is
-what the others are compared with. The same cars count in all: those that can be asked of an image (`CountedLabels`),
+what the others are compared with. The same cars count in all: those that can be asked of an image (`is_counted`),
 with the box that is returned, refined or not. With `--interval` cars move smoothly (docs/tracks.md).
 
 Prints tables in markdown: all cars, those that turn to the camera by
@@ -33,7 +33,7 @@ from command_line import run_command
 from torch import Tensor
 
 from directshape_torch.cli.options import frame_id_of
-from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
+from directshape_torch.evaluation.matching import is_counted, match_to_labels
 from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.config_files import load_config
@@ -131,10 +131,9 @@ def _refine(refiner: DirectShapeRefiner, loaded: Sequence[LoadedFrame], views: i
 def _cars(
     item: LoadedFrame, result: RefinementResult, boxes: Tensor, first_row: int, views: int, seconds: float
 ) -> Iterator[CarOfFrame]:
-    labels, counted = item.labels or [], CountedLabels()
-    objects = item.detected_objects
+    labels, objects = item.labels or [], item.detected_objects
     partners = match_to_labels(objects, labels)
-    rows = [k for k, partner in enumerate(partners) if partner >= 0 and counted.counts(labels[partner])]
+    rows = [k for k, partner in enumerate(partners) if partner >= 0 and is_counted(labels[partner])]
     true = boxes_of([labels[partners[k]] for k in rows])
     boxes = boxes[[first_row + k for k in rows]]
     errors, before = pose_errors(boxes, true), pose_errors(boxes_of([objects[k] for k in rows]), true)

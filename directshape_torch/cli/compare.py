@@ -12,7 +12,6 @@ import argparse
 from pathlib import Path
 
 from directshape_torch.cli.options import add_frame_choice, add_interval_options
-from directshape_torch.evaluation.bootstrap import BootstrapSettings
 from directshape_torch.evaluation.comparison import compare_results
 from directshape_torch.evaluation.reports import format_comparison, write_comparison_csv, write_scores
 
@@ -46,7 +45,8 @@ def run(args: argparse.Namespace) -> int:
         split=args.split,
         frames=args.frames,
         shapes_dir=args.shapes,
-        bootstrap=BootstrapSettings(args.draws, seed=args.seed),
+        num_draws=args.draws,
+        seed=args.seed,
     )
     print(format_comparison(comparison), end="")
     if args.json is not None:

@@ -11,10 +11,8 @@ import argparse
 from pathlib import Path
 
 from directshape_torch.cli.options import add_frame_choice, add_interval_options
-from directshape_torch.evaluation.bootstrap import BootstrapSettings
 from directshape_torch.evaluation.evaluate_shapes import evaluate_shapes
 from directshape_torch.evaluation.reports import format_shape_scores, write_scores, write_shape_scores_csv
-from directshape_torch.io.run_manifest import hash_prior
 from directshape_torch.shape.load_prior import load_prior
 
 
@@ -30,7 +28,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--labels", type=Path, metavar="DIR", help="default: ROOT/training/label_2")
     add_frame_choice(parser, "all that have truth")
-    parser.add_argument("--prior", metavar="FILE|NAME", help="the shape prior of the refinement (default: pca)")
+    parser.add_argument(
+        "--prior", default="pca", metavar="FILE|NAME", help="the shape prior of the refinement (default: pca)"
+    )
     add_interval_options(parser)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all curves")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write one line for each label and tau")
@@ -38,18 +38,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Evaluate, print and write."""
-    prior = load_prior("pca" if args.prior is None else args.prior)
     scores = evaluate_shapes(
         args.data,
         args.detections,
         args.refined,
-        prior,
+        load_prior(args.prior),
         masks=args.masks,
         labels_dir=args.labels,
         frames=args.frames,
         split=args.split,
-        prior_sha256=hash_prior(prior),
-        bootstrap=BootstrapSettings(args.draws, seed=args.seed),
+        num_draws=args.draws,
+        seed=args.seed,
     )
     print(format_shape_scores(scores), end="")
     if args.json is not None:

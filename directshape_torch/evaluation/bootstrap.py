@@ -19,18 +19,6 @@ _MOST_ELEMENTS = 4_000_000
 
 
 @dataclass(frozen=True)
-class BootstrapSettings:
-    """How the 95 % intervals are drawn: how often, and the seed of the random draws."""
-
-    num_draws: int = 2000
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.num_draws < 1:
-            raise InputError("num_draws", "at least 1", str(self.num_draws))
-
-
-@dataclass(frozen=True)
 class Estimate:
     """A figure and its confidence interval; `low` and `high` are None where there are fewer than two cars."""
 
@@ -53,22 +41,22 @@ class CarBootstrap:
 
     Args:
         num_cars: N, at least 1.
-        settings: of the intervals.
+        num_draws: at least 1.
+        seed: of the draws.
 
     Raises:
-        InputError: no cars.
+        InputError: no cars, or no draws.
 
     Examples:
         >>> CarBootstrap(4).estimate(np.ones(4))
         Estimate(value=1.0, low=1.0, high=1.0)
     """
 
-    def __init__(self, num_cars: int, settings: BootstrapSettings | None = None) -> None:
-        if num_cars < 1:
-            raise InputError("num_cars", "at least one", str(num_cars))
-        settings = BootstrapSettings() if settings is None else settings
-        size = settings.num_draws, num_cars
-        self._draws = np.random.default_rng(settings.seed).integers(num_cars, size=size).astype(np.int32)
+    def __init__(self, num_cars: int, num_draws: int = 2000, seed: int = 0) -> None:
+        for name, number in (("num_cars", num_cars), ("num_draws", num_draws)):
+            if number < 1:
+                raise InputError(name, "at least 1", str(number))
+        self._draws = np.random.default_rng(seed).integers(num_cars, size=(num_draws, num_cars)).astype(np.int32)
 
     def estimate(self, values: NDArray[np.float64], statistic: Statistic = np.mean) -> Estimate:
         """The statistic of `values` (N,) with its percentile interval over the draws."""

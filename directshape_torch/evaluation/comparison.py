@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.evaluation.bootstrap import BootstrapSettings, CarBootstrap, Estimate, MetricSummary, Statistic
-from directshape_torch.evaluation.matching import CountedLabels, files_of_frames, match_to_labels, named_frames
+from directshape_torch.evaluation.bootstrap import CarBootstrap, Estimate, MetricSummary, Statistic
+from directshape_torch.evaluation.matching import files_of_frames, is_counted, match_to_labels, named_frames
 from directshape_torch.evaluation.pose_error import CarErrors, errors_of
 from directshape_torch.io.kitti_labels import KittiObject, objects_in, objects_path
 from directshape_torch.io.result_files import read_shapes
@@ -87,8 +87,8 @@ def compare_results(
     split: Path | str | None = None,
     frames: Iterable[str | int] | None = None,
     shapes_dir: Path | str | None = None,
-    counted: CountedLabels | None = None,
-    bootstrap: BootstrapSettings | None = None,
+    num_draws: int = 2000,
+    seed: int = 0,
 ) -> Comparison:
     """Compare two sets of result files line by line against labels.
 
@@ -102,14 +102,12 @@ def compare_results(
         frames: ids of the frames to compare, instead of `split`.
         shapes_dir: `OUT/shapes` of the refinement: leaves out detections that had no left mask, and lines that were
             only copied; they still take their labels.
-        counted: which labels count.
-        bootstrap: settings of the confidence intervals.
+        num_draws, seed: of the confidence intervals.
 
     Raises:
         DataFormatError: a file is missing or damaged, or the two result files of a frame do not have the same lines.
         InputError: no frames.
     """
-    counted = CountedLabels() if counted is None else counted
     sources = Path(labels_dir), Path(before_dir), Path(after_dir)
     named = named_frames(frames, split)
     frame_ids = _frames_of(*sources[1:]) if named is None else named
@@ -118,35 +116,33 @@ def compare_results(
     pairs: list[_Pair] = []
     num_counted = num_found = 0
     for frame_id in frame_ids:
-        found, count = _pairs_of_frame(sources, frame_id, counted)
+        found, count = _pairs_of_frame(sources, frame_id)
         num_found += len(found)
         num_counted += count
         pairs += found if shapes_dir is None else _with_left_mask(found, Path(shapes_dir) / f"{frame_id}.npz")
     cars = _compared_cars(pairs)
-    settings = BootstrapSettings() if bootstrap is None else bootstrap
+    by_depth = {
+        f"{low:.0f}-{high:.0f} m" if high < float("inf") else f"over {low:.0f} m": [
+            car for car in cars if low <= car.depth_m < high
+        ]
+        for low, high in pairwise(_DEPTH_BINS_M)
+    }
     return Comparison(
         cars=cars,
-        overall=_summarised("all detections", cars, settings),
-        by_depth=tuple(
-            _summarised(
-                f"{low:.0f}-{high:.0f} m" if high < float("inf") else f"over {low:.0f} m",
-                [c for c in cars if low <= c.depth_m < high],
-                settings,
-            )
-            for low, high in pairwise(_DEPTH_BINS_M)
-        ),
+        overall=_summarised("all detections", cars, num_draws, seed),
+        by_depth=tuple(_summarised(name, some, num_draws, seed) for name, some in by_depth.items()),
         num_frames=len(frame_ids),
         num_labels_counted=num_counted,
         num_filtered_out=num_found - len(pairs),
     )
 
 
-def _summarised(name: str, cars: Sequence[ComparedCar], settings: BootstrapSettings) -> GroupSummary:
+def _summarised(name: str, cars: Sequence[ComparedCar], num_draws: int, seed: int) -> GroupSummary:
     if not cars:
         return GroupSummary(name, 0, {}, None)
     # By label, so that the draws do not depend on the order of the detections.
     cars = sorted(cars, key=lambda car: f"{car.frame_id}:{car.label_line}")
-    bootstrap = CarBootstrap(len(cars), settings)
+    bootstrap = CarBootstrap(len(cars), num_draws, seed)
     metrics = {}
     for metric in METRICS:
         before, after = (np.array([metric.value(getattr(car, when)) for car in cars]) for when in ("before", "after"))
@@ -173,7 +169,7 @@ def _frames_of(before: Path, after: Path) -> tuple[str, ...]:
     return tuple(frame for stem in files_of_frames(before) for frame in of_sequence.get(stem, [stem]))
 
 
-def _pairs_of_frame(sources: tuple[Path, Path, Path], frame_id: str, counted: CountedLabels) -> tuple[list[_Pair], int]:
+def _pairs_of_frame(sources: tuple[Path, Path, Path], frame_id: str) -> tuple[list[_Pair], int]:
     """Counted labels of a frame that have a detection, and the number of those that count at all."""
     label_path, before_path, after_path = (objects_path(source, frame_id) for source in sources)
     labels = objects_in(label_path, frame_id)
@@ -182,14 +178,14 @@ def _pairs_of_frame(sources: tuple[Path, Path, Path], frame_id: str, counted: Co
         raise DataFormatError(after_path, f"there is no result of frame {frame_id}", cure=cure)
     before, after = objects_in(before_path, frame_id), objects_in(after_path, frame_id)
     _check_same_lines(before_path, before, after_path, after)
-    lines = [pair for pair in zip(before, after, strict=True) if pair[0].type in counted.types and pair[0].has_box_3d]
+    lines = [pair for pair in zip(before, after, strict=True) if pair[0].type == "Car" and pair[0].has_box_3d]
     partners = match_to_labels([old for old, _ in lines], labels)
     pairs = [
         _Pair(frame_id, labels[index], *pair)
         for pair, index in zip(lines, partners, strict=True)
-        if index >= 0 and counted.counts(labels[index])
+        if index >= 0 and is_counted(labels[index])
     ]
-    return pairs, sum(counted.counts(label) for label in labels)
+    return pairs, sum(is_counted(label) for label in labels)
 
 
 def _check_same_lines(

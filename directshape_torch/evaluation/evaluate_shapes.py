@@ -5,20 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.evaluation.bootstrap import BootstrapSettings, CarBootstrap, MetricSummary
-from directshape_torch.evaluation.matching import CountedLabels, match_to_labels, named_frames
-from directshape_torch.evaluation.shape_error import EstimatedCar, SegmentSource, ShapeError
+from directshape_torch.evaluation.bootstrap import CarBootstrap, MetricSummary
+from directshape_torch.evaluation.matching import is_counted, match_to_labels, named_frames
+from directshape_torch.evaluation.shape_error import TAUS_M, EstimatedCar, ShapeError, folder_of_maps, segments_of
 from directshape_torch.io.instance_masks import MaskSource, file_of_frame
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import poses_cam, read_objects
 from directshape_torch.io.mask_files import mask_source
 from directshape_torch.io.result_files import ShapeArrays, read_shapes
 from directshape_torch.io.run_folder import shapes_path
+from directshape_torch.io.run_manifest import hash_prior
 from directshape_torch.shape.shape_prior import ShapePrior
 
 
@@ -73,9 +75,8 @@ def evaluate_shapes(
     labels_dir: Path | str | None = None,
     frames: Iterable[str | int] | None = None,
     split: Path | str | None = None,
-    prior_sha256: str | None = None,
-    counted: CountedLabels | None = None,
-    bootstrap: BootstrapSettings | None = None,
+    num_draws: int = 2000,
+    seed: int = 0,
 ) -> ShapeScores:
     """Completeness, accuracy, F1 and RMSE (see `shape_error`) of the input and of the output of a refinement.
 
@@ -87,15 +88,13 @@ def evaluate_shapes(
         data_dir: folder that holds `training` with calib and the truth: `disp_occ_0` (KITTI Stereo 2015) or `depth_2`.
         detections_dir: result files that went into the refinement; "before" is the mean shape at their poses.
         refined_dir: output folder of `directshape refine`, with `shapes`.
-        prior: the one that the refinement used.
+        prior: the one that the refinement used; shapes of another one are refused.
         masks: the segments: a folder (see `mask_source`) or a source. One ray is cast for each pixel of a car's segment
             whose true depth is known.
         labels_dir: default `training/label_2`.
         frames: ids of the frames, or their numbers; default all that have both shapes and truth.
         split: file with one frame id a line, instead of `frames`.
-        prior_sha256: of the prior; shapes of another one are refused. None does not check.
-        counted: which labels count.
-        bootstrap: settings of the confidence intervals, which are over cars.
+        num_draws, seed: of the confidence intervals, which are over cars.
 
     Raises:
         DataFormatError: a file is missing or damaged, or belongs to another prior.
@@ -108,25 +107,24 @@ def evaluate_shapes(
         )
     inputs = _Inputs(
         training=training,
+        maps=folder_of_maps(training),
+        masks=mask_source(masks) if isinstance(masks, (str, Path)) else masks,
         labels_dir=training / "label_2" if labels_dir is None else Path(labels_dir),
         detections_dir=Path(detections_dir),
         refined_dir=Path(refined_dir),
-        source=SegmentSource(training, mask_source(masks) if isinstance(masks, (str, Path)) else masks),
         prior=prior,
-        prior_sha256=prior_sha256,
-        counted=CountedLabels() if counted is None else counted,
+        prior_sha256=hash_prior(prior),
     )
-    frame_ids = inputs.choose_frames(named_frames(frames, split))
-    found, counts, with_truth = zip(*(inputs.evaluate(frame_id) for frame_id in frame_ids), strict=True)
+    frame_ids = _chosen(inputs, named_frames(frames, split))
+    found, counts, with_truth = zip(*(_evaluated(inputs, frame_id) for frame_id in frame_ids), strict=True)
     cars = tuple(car for cars_of_frame in found for car in cars_of_frame)
     if not cars:
         raise InputError(
             "frames", "a counted label with a detection and a true surface", f"none in {len(frame_ids)} frames"
         )
-    settings = BootstrapSettings() if bootstrap is None else bootstrap
     return ShapeScores(
         cars=cars,
-        curves=tuple(_curve(metric, cars, settings) for metric in METRICS),
+        curves=tuple(_curve(metric, cars, num_draws, seed) for metric in METRICS),
         num_frames=len(frame_ids),
         num_labels_counted=sum(counts),
         num_without_truth=sum(counts) - sum(with_truth),
@@ -135,86 +133,83 @@ def evaluate_shapes(
     )
 
 
-@dataclass(frozen=True)
-class _Inputs:
+class _Inputs(NamedTuple):
     training: Path
+    maps: Path  # folder of true depths
+    masks: MaskSource
     labels_dir: Path
     detections_dir: Path
     refined_dir: Path
-    source: SegmentSource
     prior: ShapePrior
-    prior_sha256: str | None
-    counted: CountedLabels
+    prior_sha256: str
 
-    def choose_frames(self, named: tuple[str, ...] | None) -> tuple[str, ...]:
-        known = self.source.frame_ids()
-        if named is None:
-            named = tuple(frame_id for frame_id in known if shapes_path(self.refined_dir, frame_id).is_file())
-        if missing := sorted(set(named) - set(known)):
-            raise InputError("frames", "frames with ground truth", ", ".join(missing[:5]))
-        if not named:
-            where = f"{self.refined_dir} has no shapes/NNNNNN.npz of any of the {len(known)} frames with ground truth"
-            raise InputError("frames", "refined frames with ground truth", f"none: {where}")
-        return named
 
-    def evaluate(self, frame_id: str) -> tuple[list[EvaluatedCar], int, int]:
-        """The cars of a frame, how many labels count, and how many of these have a true surface."""
-        name, prior = f"{frame_id}.txt", self.prior
-        camera = to_stereo_camera([read_calibration(self.training / "calib" / name)], dtype=torch.float64)
-        labels, detections = (
-            read_objects(file_of_frame(folder, name)) for folder in (self.labels_dir, self.detections_dir)
+def _chosen(inputs: _Inputs, named: tuple[str, ...] | None) -> tuple[str, ...]:
+    known = sorted(path.stem for path in inputs.maps.glob("*.png"))
+    if named is None:
+        named = tuple(frame_id for frame_id in known if shapes_path(inputs.refined_dir, frame_id).is_file())
+    if missing := sorted(set(named) - set(known)):
+        raise InputError("frames", "frames with ground truth", ", ".join(missing[:5]))
+    if not named:
+        where = f"{inputs.refined_dir} has no shapes/NNNNNN.npz of any of the {len(known)} frames with ground truth"
+        raise InputError("frames", "refined frames with ground truth", f"none: {where}")
+    return named
+
+
+def _evaluated(inputs: _Inputs, frame_id: str) -> tuple[list[EvaluatedCar], int, int]:
+    """The cars of a frame, how many labels count, and how many of these have a true surface."""
+    name, prior = f"{frame_id}.txt", inputs.prior
+    camera = to_stereo_camera([read_calibration(inputs.training / "calib" / name)], dtype=torch.float64)
+    labels, detections = (
+        read_objects(file_of_frame(folder, name)) for folder in (inputs.labels_dir, inputs.detections_dir)
+    )
+    shapes = _shapes(inputs, frame_id, len(detections))
+    # All labels compete for a mask, so that one that does not count keeps its own.
+    in_space = [label for label in labels if label.has_box_3d]
+    truths = segments_of(inputs.maps / f"{frame_id}.png", inputs.masks, in_space, camera)
+    row_of_line = {line: row for row, line in enumerate(shapes.input_lines.tolist())}
+    refined = [detection for detection in detections if detection.line_number in row_of_line]
+    cars = []
+    for detection, partner in zip(refined, match_to_labels(refined, labels), strict=True):
+        truth = truths.get(labels[partner].line_number) if partner >= 0 else None
+        if truth is None or not is_counted(labels[partner]):
+            continue
+        row = row_of_line[detection.line_number]
+        code, T_refined = (torch.from_numpy(array[row]).double() for array in (shapes.codes, shapes.T_cam_obj))
+        T_input = poses_cam([detection], camera.t_cam_ref[0])[0]
+        car = EvaluatedCar(
+            frame_id=frame_id,
+            detection_line=detection.line_number,
+            label_line=labels[partner].line_number,
+            status=shapes.statuses[row],
+            depth_m=labels[partner].location_ref[2],
+            segment=truth.segment,
+            before=truth.errors(EstimatedCar(prior, prior.initial_code(1)[0], T_input)),
+            after=truth.errors(EstimatedCar(prior, code, T_refined)),
         )
-        shapes = self._shapes(frame_id, len(detections))
-        # All labels compete for a mask, so that one that does not count keeps its own.
-        truths = self.source.truths(frame_id, [label for label in labels if label.has_box_3d], camera)
-        row_of_line = {line: row for row, line in enumerate(shapes.input_lines.tolist())}
-        refined = [detection for detection in detections if detection.line_number in row_of_line]
-        partners = zip(match_to_labels(refined, labels), refined, strict=True)
-        detection_of = {labels[index].line_number: detection for index, detection in partners if index >= 0}
-        counted = [label for label in labels if self.counted.counts(label)]
-        cars = []
-        for label in counted:
-            truth, detection = truths.get(label.line_number), detection_of.get(label.line_number)
-            if truth is None or detection is None:
-                continue
-            row = row_of_line[detection.line_number]
-            code, T_refined = (torch.from_numpy(array[row]).double() for array in (shapes.codes, shapes.T_cam_obj))
-            T_input = poses_cam([detection], camera.t_cam_ref[0])[0]
-            car = EvaluatedCar(
-                frame_id=frame_id,
-                detection_line=detection.line_number,
-                label_line=label.line_number,
-                status=shapes.statuses[row],
-                depth_m=label.location_ref[2],
-                segment=truth.segment,
-                before=truth.errors(EstimatedCar(prior, prior.initial_code(1)[0], T_input)),
-                after=truth.errors(EstimatedCar(prior, code, T_refined)),
-            )
-            cars.append(car)
-        cars.sort(key=lambda car: car.detection_line)
-        return cars, len(counted), sum(label.line_number in truths for label in counted)
-
-    def _shapes(self, frame_id: str, num_lines: int) -> ShapeArrays:
-        path = shapes_path(self.refined_dir, frame_id)
-        shapes = read_shapes(path)
-        if self.prior_sha256 is not None and shapes.prior_sha256 != self.prior_sha256:
-            cure = "give the prior that the refinement used"
-            raise DataFormatError(path, "holds codes of another shape prior", cure=cure)
-        if shapes.codes.shape[1] != self.prior.num_codes:
-            raise DataFormatError(path, f"has {shapes.codes.shape[1]} codes, the shape prior {self.prior.num_codes}")
-        if len(shapes.input_lines) and shapes.input_lines.max() > num_lines:
-            problem = f"names line {shapes.input_lines.max()} of a detection file that has {num_lines} lines"
-            raise DataFormatError(path, problem, cure="give the detections that went into the refinement")
-        return shapes
+        cars.append(car)
+    counted = [label.line_number for label in labels if is_counted(label)]
+    return cars, len(counted), sum(line in truths for line in counted)
 
 
-def _curve(metric: str, cars: Sequence[EvaluatedCar], settings: BootstrapSettings) -> ShapeCurve:
+def _shapes(inputs: _Inputs, frame_id: str, num_lines: int) -> ShapeArrays:
+    path = shapes_path(inputs.refined_dir, frame_id)
+    shapes = read_shapes(path)
+    if shapes.prior_sha256 != inputs.prior_sha256:
+        cure = "give the prior that the refinement used"
+        raise DataFormatError(path, "holds codes of another shape prior", cure=cure)
+    if len(shapes.input_lines) and shapes.input_lines.max() > num_lines:
+        problem = f"names line {shapes.input_lines.max()} of a detection file that has {num_lines} lines"
+        raise DataFormatError(path, problem, cure="give the detections that went into the refinement")
+    return shapes
+
+
+def _curve(metric: str, cars: Sequence[EvaluatedCar], num_draws: int, seed: int) -> ShapeCurve:
     sides = ([getattr(getattr(car, when), metric) for car in cars] for when in ("before", "after"))
     before, after = (np.array(side, dtype=np.float64) for side in sides)  # (N, T)
     known = np.isfinite(before) & np.isfinite(after)
     summaries = [
-        CarBootstrap(int(kept.sum()), settings).summary(b[kept], a[kept]) if kept.any() else None
+        CarBootstrap(int(kept.sum()), num_draws, seed).summary(b[kept], a[kept]) if kept.any() else None
         for b, a, kept in zip(before.T, after.T, known.T, strict=True)
     ]
-    taus = tuple(cars[0].after.taus_m.tolist())
-    return ShapeCurve(metric, taus, tuple(known.sum(axis=0).tolist()), tuple(summaries))
+    return ShapeCurve(metric, TAUS_M, tuple(known.sum(axis=0).tolist()), tuple(summaries))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,34 +14,26 @@ from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.io.kitti_labels import KittiObject
 
 _MINIMUM_IOU_2D = 0.3
+# Of labels that count: KITTI's level 1 is partly occluded; the share outside of the image.
+_LEAST_HEIGHT_PX, _MOST_OCCLUDED, _MOST_TRUNCATED = 25.0, 1, 0.5
 
 
-@dataclass(frozen=True)
-class CountedLabels:
-    """Which labels a comparison counts: the class, and what can fairly be asked of an image."""
-
-    types: tuple[str, ...] = ("Car",)  # class names
-    minimum_height_px: float = 25.0  # of the 2D box
-    maximum_occluded: int = 1  # KITTI's level, 0 visible, 1 partly, 2 largely occluded
-    maximum_truncated: float = 0.5  # share of the object outside the image
-
-    def counts(self, label: KittiObject) -> bool:
-        """Whether a label counts."""
-        height_px = label.box_2d[3] - label.box_2d[1]
-        return (
-            label.type in self.types
-            and label.has_box_3d
-            and height_px >= self.minimum_height_px
-            and label.occluded <= self.maximum_occluded
-            and label.truncated <= self.maximum_truncated
-        )
+def is_counted(label: KittiObject, types: Collection[str] = ("Car",)) -> bool:
+    """Whether a label is of the class, and can fairly be asked of an image: 25 px high, mostly visible."""
+    return (
+        label.type in types
+        and label.has_box_3d
+        and label.box_2d[3] - label.box_2d[1] >= _LEAST_HEIGHT_PX
+        and label.occluded <= _MOST_OCCLUDED
+        and label.truncated <= _MOST_TRUNCATED
+    )
 
 
 def match_to_labels(detections: Sequence[KittiObject], labels: Sequence[KittiObject]) -> list[int]:
     """For each detection the index of its label, or -1: largest 2D overlap of at least 0.3 first, one to one.
 
     Labels of every class with a 3D box compete, so that a detection of a van is not given to the car behind it; which
-    of the matched labels count is another question (`CountedLabels`). Of equal overlaps the first detection's is taken.
+    of the matched labels count is another question (`is_counted`). Of equal overlaps the first detection's is taken.
     """
     known = [index for index, label in enumerate(labels) if label.has_box_3d]
     overlap = box_iou(_image_boxes(detections), _image_boxes([labels[index] for index in known]))

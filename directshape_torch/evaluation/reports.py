@@ -117,7 +117,7 @@ def format_shape_scores(found: ShapeScores) -> str:
 def _curve_rows(curve: ShapeCurve) -> list[list[str]]:
     rows = [[_SHAPE_TITLES[curve.metric], "n", "before", "after", "change"]]
     for tau, num_cars, summary in zip(curve.taus_m, curve.num_cars, curve.summaries, strict=True):
-        if any(math.isclose(tau, printed) for printed in _PRINTED_TAUS_M) or curve.taus_m != TAUS_M:
+        if tau in _PRINTED_TAUS_M:
             cells = ["-"] * 3 if summary is None else _with_change("m" if curve.metric == "rmse_m" else "%", summary)
             rows.append([f"tau {tau:.2f} m", str(num_cars), *cells])
     return rows
@@ -132,7 +132,7 @@ def write_shape_scores_csv(path: Path | str, cars: Sequence[EvaluatedCar]) -> No
     for car in cars:
         sides = (car.before, car.after)
         figures = [getattr(side, name).tolist() for name in evaluate_shapes.METRICS for side in sides]
-        for k, tau in enumerate(car.after.taus_m.tolist()):
+        for k, tau in enumerate(TAUS_M):
             row = [getattr(car, name) for name in _SHAPE_COLUMNS] + [tau, car.after.num_true]
             rows.append([*row, *(side.num_estimated for side in sides), *(values[k] for values in figures)])
     write_csv(path, rows)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,36 +34,15 @@ TAUS_M = tuple(k / 20 for k in range(1, 21))
 
 @dataclass(frozen=True)
 class ShapeError:
-    """Matches between the true and the estimated points of one car at T distances tau."""
+    """How well the true and the estimated points of one car match, at T distances tau; shares but for the last."""
 
-    taus_m: NDArray[np.float64]  # (T,)
     num_true: int
     num_estimated: int
-    num_true_matched: NDArray[np.int64]  # (T,) true points with an estimated point within tau
-    num_estimated_matched: NDArray[np.int64]  # (T,) estimated points with a true point within tau
-    squared_distances_m2: NDArray[np.float64]  # (T,) of the matched true points to their closest estimates, sum
-
-    @property
-    def completeness(self) -> NDArray[np.float64]:
-        """Share (T,) of the true points that are matched."""
-        return self.num_true_matched / self.num_true
-
-    @property
-    def accuracy(self) -> NDArray[np.float64]:
-        """Share (T,) of the estimated points that are matched; 0 where there are no estimated points."""
-        return self.num_estimated_matched / max(1, self.num_estimated)
-
-    @property
-    def f1(self) -> NDArray[np.float64]:
-        """Harmonic mean (T,) of completeness and accuracy; 0 where both are."""
-        total = self.completeness + self.accuracy
-        return 2 * self.completeness * self.accuracy / np.where(total > 0, total, 1.0)
-
-    @property
-    def rmse_m(self) -> NDArray[np.float64]:
-        """Root mean square (T,) of the distances of the matched true points, metres; NaN where none is matched."""
-        mean = self.squared_distances_m2 / np.maximum(1, self.num_true_matched)
-        return np.where(self.num_true_matched > 0, np.sqrt(mean), np.nan)
+    completeness: NDArray[np.float64]  # (T,) of the true points, those with an estimated point within tau
+    accuracy: NDArray[np.float64]  # (T,) of the estimated points, those with a true point within tau; 0 without any
+    f1: NDArray[np.float64]  # (T,) harmonic mean of the two; 0 where both are
+    # (T,) root mean square of the distances of matched true points to their closest estimates, metres; NaN without any.
+    rmse_m: NDArray[np.float64]
 
 
 def shape_error(
@@ -108,13 +87,18 @@ def shape_error(
     to_estimated = cKDTree(estimated).query(true)[0] if len(estimated) else np.full(len(true), np.inf)
     to_true = cKDTree(true).query(estimated)[0] if len(estimated) else np.zeros(0)
     matched = to_estimated <= taus[:, None]
+    num_matched = matched.sum(axis=1)
+    completeness = num_matched / len(true)
+    accuracy = (to_true <= taus[:, None]).sum(axis=1) / max(1, len(estimated))
+    total = completeness + accuracy
+    squares_m2 = np.square(np.where(matched, to_estimated, 0.0)).sum(axis=1)
     return ShapeError(
-        taus_m=taus,
         num_true=len(true),
         num_estimated=len(estimated),
-        num_true_matched=matched.sum(axis=1),
-        num_estimated_matched=(to_true <= taus[:, None]).sum(axis=1),
-        squared_distances_m2=np.square(np.where(matched, to_estimated, 0.0)).sum(axis=1),
+        completeness=completeness,
+        accuracy=accuracy,
+        f1=2 * completeness * accuracy / np.where(total > 0, total, 1.0),
+        rmse_m=np.where(num_matched > 0, np.sqrt(squares_m2 / np.maximum(1, num_matched)), np.nan),
     )
 
 
@@ -149,10 +133,7 @@ class EstimatedCar:
 
 @dataclass(frozen=True)
 class SegmentTruth:
-    """The N pixels inside the segment of one car whose true depth is known.
-
-    One ray is cast for each of these pixels, so a shape that fits perfectly gives the true points themselves.
-    """
+    """The N pixels inside the segment of one car whose true depth is known."""
 
     segment: str  # which pixels these are, for reports
     uv_left: NDArray[np.float64]  # (N, 2) pixels of the left image
@@ -160,63 +141,51 @@ class SegmentTruth:
     K_left: Tensor  # (3, 3) pixels
 
     def errors(self, car: EstimatedCar) -> ShapeError:
-        """Errors of an estimated car."""
+        """Of an estimated car: a ray a pixel, so that a perfect shape gives the true points themselves."""
         points_cam = car.points_at_pixels(self.uv_left, self.K_left)
         return shape_error(self.points_cam, points_cam[np.isfinite(points_cam).all(axis=1)])
 
 
-@dataclass(frozen=True)
-class SegmentSource:
-    """Disparity or depth maps of a data set and the masks that say which pixels belong to a car.
+def folder_of_maps(training: Path) -> Path:
+    """The folder of true maps, 16 bits, 0 where unknown: `disp_occ_0` (disparity x 256), or else `depth_2` (metres x
+    256).
+
+    Raises:
+        DataFormatError: neither is there.
+    """
+    for folder in (training / "disp_occ_0", training / "depth_2"):
+        if folder.is_dir():
+            return folder
+    raise DataFormatError(training, "holds neither disp_occ_0 nor depth_2", cure="give true disparities")
+
+
+def segments_of(
+    path: Path, masks: MaskSource, labels: Sequence[KittiObject], camera: StereoCamera
+) -> dict[int, SegmentTruth]:  # by line number of the label
+    """The segments of the labels of a frame that have a mask with known depths in it.
 
     The segment of a label is the mask of the left image of largest overlap with its 2D box (at least 0.3, one to one).
 
     Args:
-        training: folder with `disp_occ_0/NNNNNN.png` (disparity x 256), or else `depth_2/NNNNNN.png` (metres x 256),
-            16 bits, 0 where unknown.
+        path: the frame's map, in one of the folders of `folder_of_maps`.
         masks: of the left images.
+        labels: all with a 3D box: they compete for the masks.
+        camera: of the frame.
 
     Raises:
-        DataFormatError: neither folder is there.
+        DataFormatError: the map or the masks are missing or damaged.
     """
-
-    training: Path
-    masks: MaskSource
-
-    def __post_init__(self) -> None:
-        if not self.folder.is_dir():
-            raise DataFormatError(self.training, "holds neither disp_occ_0 nor depth_2", cure="give true disparities")
-
-    @property
-    def folder(self) -> Path:
-        """Of the maps."""
-        disparities = self.training / "disp_occ_0"
-        return disparities if disparities.is_dir() else self.training / "depth_2"
-
-    def frame_ids(self) -> tuple[str, ...]:
-        """The frames that have a map."""
-        return tuple(sorted(path.stem for path in self.folder.glob("*.png")))
-
-    def truths(
-        self, frame_id: str, labels: Sequence[KittiObject], camera: StereoCamera
-    ) -> Mapping[int, SegmentTruth]:  # by line number of the label
-        """The segments of the labels of a frame that have a mask with known depths in it.
-
-        Raises:
-            DataFormatError: the map or the masks are missing or damaged.
-        """
-        path = self.folder / f"{frame_id}.png"
-        depth = read_depth(path) if self.folder.name == "depth_2" else _depth_of(read_disparity(path), camera)
-        masks = [mask for mask in self.masks.read(frame_id, depth.shape) if mask.side == "left"]
-        boxes = np.array([label.box_2d for label in labels], dtype=np.float64).reshape(-1, 4)
-        found: dict[int, SegmentTruth] = {}
-        for label, index in zip(labels, match_masks(boxes, masks)[0], strict=True):
-            if index >= 0:
-                inside = np.asarray(masks[index].probability) > 0.5
-                truth = segment_truth(f"left mask {masks[index].instance_id}", depth, inside, camera)
-                if len(truth.points_cam):
-                    found[label.line_number] = truth
-        return found
+    depth = read_depth(path) if path.parent.name == "depth_2" else _depth_of(read_disparity(path), camera)
+    found = [mask for mask in masks.read(path.stem, depth.shape) if mask.side == "left"]
+    boxes = np.array([label.box_2d for label in labels], dtype=np.float64).reshape(-1, 4)
+    truths: dict[int, SegmentTruth] = {}
+    for label, index in zip(labels, match_masks(boxes, found)[0], strict=True):
+        if index >= 0:
+            inside = np.asarray(found[index].probability) > 0.5
+            truth = segment_truth(f"left mask {found[index].instance_id}", depth, inside, camera)
+            if len(truth.points_cam):
+                truths[label.line_number] = truth
+    return truths
 
 
 def segment_truth(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
-from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
+from directshape_torch.evaluation.matching import is_counted, match_to_labels
 from directshape_torch.evaluation.pose_error import errors_of
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.run_folder import FrameResult
@@ -104,9 +104,9 @@ def _judged(
     """
     partners = {car: partner for car, partner in enumerate(match_to_labels(after, labels)) if partner >= 0}
     cars, true = list(partners), [labels[partner] for partner in partners.values()]
-    counted = CountedLabels(tuple({o.type for o in after}))
+    types = {o.type for o in after}
     judged: dict[int, dict[str, Any]] = {
-        car: {"counts": counted.counts(label)} for car, label in zip(cars, true, strict=True)
+        car: {"counts": is_counted(label, types)} for car, label in zip(cars, true, strict=True)
     }
     for side, objects in (("before", before), ("after", after)):
         errors = [] if objects is None else errors_of([objects[car] for car in cars], true)

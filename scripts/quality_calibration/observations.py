@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
+from directshape_torch.evaluation.matching import is_counted, match_to_labels
 from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
 from directshape_torch.files.read_files import read_npz
 from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
@@ -185,10 +185,10 @@ def observe(
 def _counted(loaded: LoadedFrame, result: RefinementResult) -> tuple[list[int], list[KittiObject]]:
     objects = [loaded.input_objects[row] for row in loaded.row_of_detection]
     assert loaded.labels is not None
-    refined, masked, counts = result.refined.tolist(), loaded.detections.has_mask_left.tolist(), CountedLabels()
+    refined, masked = result.refined.tolist(), loaded.detections.has_mask_left.tolist()
     pairs = [
         (row, loaded.labels[partner])
         for row, partner in enumerate(match_to_labels(objects, loaded.labels))
-        if partner >= 0 and refined[row] and masked[row] and counts.counts(loaded.labels[partner])
+        if partner >= 0 and refined[row] and masked[row] and is_counted(loaded.labels[partner])
     ]
     return [row for row, _ in pairs], [label for _, label in pairs]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
+from directshape_torch.evaluation.matching import is_counted, match_to_labels
 from directshape_torch.files.read_files import Line
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
 
@@ -52,4 +52,4 @@ def test_a_van_keeps_its_detection_and_dontcare_takes_none():
     ],
 )
 def test_counted_labels(label: KittiObject, counts: bool):
-    assert CountedLabels().counts(label) is counts
+    assert is_counted(label) is counts

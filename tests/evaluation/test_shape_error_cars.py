@@ -21,9 +21,8 @@ from helpers.synthetic_scene import TWO_CARS, street
 
 from directshape_torch.cli.main import main
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.evaluation.bootstrap import BootstrapSettings
+from directshape_torch.evaluation import matching
 from directshape_torch.evaluation.evaluate_shapes import ShapeScores, evaluate_shapes
-from directshape_torch.evaluation.matching import CountedLabels
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.projection import depth_from_disparity
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
@@ -33,9 +32,6 @@ from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 FRAMES = ("000000", "000001")
-# The second car is 18 px high.
-BOTH = CountedLabels(minimum_height_px=10.0)
-FEW = BootstrapSettings(num_draws=200)
 T_CAM_OBJ = pose_from_kitti(torch.tensor(TWO_CARS[0], dtype=torch.float64), torch.tensor(TWO_CARS[1]).double())
 
 
@@ -73,9 +69,11 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def evaluate(root: Path, refined: str = "perfect", **options: Any) -> ShapeScores:
-    settings: dict[str, Any] = {"counted": BOTH, "bootstrap": FEW, "masks": root / "masks"} | options
+    settings: dict[str, Any] = {"num_draws": 200, "masks": root / "masks"} | options
     prior = load_prior(root / "prior.npz")
-    return evaluate_shapes(root, root / "detections", root / refined, prior, **settings)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(matching, "_LEAST_HEIGHT_PX", 10.0)  # the second car is 18 px high
+        return evaluate_shapes(root, root / "detections", root / refined, prior, **settings)
 
 
 def command(root: Path, refined: Path, *extra: str) -> list[str]:
@@ -180,11 +178,13 @@ def test_errors_name_what_is_wrong(root: Path, tmp_path: Path, capsys: pytest.Ca
     assert "holds no folder 'training'" in fails(root / "perfect", "--data", str(tmp_path / "no"))
 
 
-def test_library_errors(root: Path) -> None:
+def test_library_errors(root: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="frames or split, got both"):
         evaluate(root, frames=["000000"], split="x")
+    for frame_id in FRAMES:
+        (tmp_path / f"{frame_id}.txt").write_text("")
     with pytest.raises(InputError, match="a counted label with a detection and a true surface, got none in 2 frames"):
-        evaluate(root, counted=CountedLabels(types=("Van",)))
+        evaluate(root, labels_dir=tmp_path)
 
 
 def test_detections_of_another_run_are_named(root: Path, tmp_path: Path) -> None:
@@ -193,7 +193,7 @@ def test_detections_of_another_run_are_named(root: Path, tmp_path: Path) -> None
         (tmp_path / f"{frame_id}.txt").write_text(first + "\n")
     prior = load_prior(root / "prior.npz")
     with pytest.raises(DataFormatError, match="names line 3 of a detection file that has 1 lines"):
-        evaluate_shapes(root, tmp_path, root / "perfect", prior, masks=root / "masks", counted=BOTH)
+        evaluate_shapes(root, tmp_path, root / "perfect", prior, masks=root / "masks")
 
 
 @pytest.mark.skipif("DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA is not set: frame 007322 needed")
