@@ -155,7 +155,7 @@ def difference(default: Comparison, found: Comparison) -> str:
 def ap_cells(args: argparse.Namespace, results: Path) -> list[str]:
     """Average precision over 11 recall points, moderate, as in the paper."""
     frames = args.frames or sorted(path.stem for path in (folder_of(args, DEFAULT) / "data").glob("*.txt"))
-    scores = evaluate_kitti(args.data / "training" / "label_2", results, split=frames)
+    scores = evaluate_kitti(args.data / "training" / "label_2", results, frames=frames)
     return [f"{scores.score(m, iou, 'moderate').ap_r11:.1f}" for m in ("bev", "3d") for iou in (0.5, 0.7)]
 
 

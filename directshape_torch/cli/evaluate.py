@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from directshape_torch.cli.options import add_frame_choice
 from directshape_torch.evaluation.kitti_ap import evaluate_kitti
 from directshape_torch.evaluation.reports import format_scores, write_scores
 
@@ -18,14 +19,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Labels, results and the class."""
     parser.add_argument("--labels", type=Path, required=True, metavar="DIR", help="KITTI labels, NNNNNN.txt")
     parser.add_argument("--results", type=Path, required=True, metavar="DIR", help="result files (or DIR/data)")
-    parser.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line; default: all of --labels")
+    add_frame_choice(parser, "all of --labels")
     parser.add_argument("--type", default="Car", metavar="CLASS", help="Car (default), Pedestrian, Cyclist ..")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all scores and curves")
 
 
 def run(args: argparse.Namespace) -> int:
     """Evaluate, print and write."""
-    scores = evaluate_kitti(args.labels, args.results, split=args.split, object_type=args.type)
+    scores = evaluate_kitti(args.labels, args.results, frames=args.frames, split=args.split, object_type=args.type)
     print(format_scores(scores), end="")
     if args.json is not None:
         write_scores(args.json, scores)

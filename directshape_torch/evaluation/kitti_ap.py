@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
 
@@ -11,12 +11,10 @@ import numpy as np
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.kitti_rules import DIFFICULTIES, Curve, Difficulty, Floats, KittiScene, Metric
-from directshape_torch.evaluation.matching import files_of_frames
-from directshape_torch.files.read_files import read_lines
+from directshape_torch.evaluation.matching import files_of_frames, named_frames
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 
 MINIMUM_IOUS = (0.7, 0.5)
-ObjectsByFrame = Mapping[str, Sequence[KittiObject]]
 
 
 @dataclass(frozen=True)
@@ -43,11 +41,11 @@ class KittiScores:
 
     object_type: str  # the class
     num_frames: int  # frames evaluated
-    num_frames_without_results: int  # those of them that have no results; their labels are missed
-    num_result_frames_unused: int  # frames that have results and are not evaluated
     num_detections: int  # detections of the class in the evaluated frames
     # For every metric, overlap and difficulty; bev and 3d are left out where no detection has a 3D box.
     scores: tuple[ApScore, ...]
+    num_frames_without_results: int = 0  # those of the frames that have no result file; their labels are missed
+    num_result_frames_unused: int = 0  # frames that have results and are not evaluated
 
     def score(self, metric: str, minimum_iou: float, difficulty: str) -> ApScore:
         """The scores of one cell.
@@ -63,57 +61,70 @@ class KittiScores:
 
 
 def evaluate_kitti(
-    labels: Path | str | ObjectsByFrame,
-    results: Path | str | ObjectsByFrame,
+    labels_dir: Path | str,
+    results_dir: Path | str,
     *,
-    split: Path | str | Sequence[str] | None = None,
+    frames: Iterable[str | int] | None = None,
+    split: Path | str | None = None,
     object_type: str = "Car",
 ) -> KittiScores:
-    """Score detections as KITTI's devkit (2017) does: 2D, bird's-eye view and 3D, at IoU 0.5 and 0.7.
+    """Score files of detections as KITTI's devkit (2017) does: 2D, bird's-eye view and 3D, at IoU 0.5 and 0.7.
 
     Args:
-        labels: folder of KITTI labels `NNNNNN.txt` (usually `training/label_2`), or objects by frame id.
-        results: folder of result files `NNNNNN.txt` with scores, or above a folder `data` with them, or objects by
-            frame id. A frame without results counts as missed.
-        split: frame ids, or a file with one a line; default every frame that has labels.
+        labels_dir: folder of KITTI labels `NNNNNN.txt` (usually `training/label_2`).
+        results_dir: folder of result files `NNNNNN.txt` with scores, or above a folder `data` with them. A frame
+            without results counts as missed.
+        frames: ids of the frames, or their numbers; default every frame that has labels.
+        split: file with one frame id a line, instead of `frames`.
         object_type: the class to score; labels of its neighbour (Van for Car) are ignored.
 
     Raises:
         DataFormatError: a folder, a label file of the split or a line is missing or damaged, or a result has no score.
         InputError: no frame has labels, or none has results.
+    """
+    labels, results = _files(labels_dir, "labels"), _files(results_dir, "results")
+    named = named_frames(frames, split)
+    frame_ids = tuple(labels) if named is None else named
+    with_results = [frame_id for frame_id in frame_ids if frame_id in results]
+    if not frame_ids:
+        raise InputError("labels", "label files NNNNNN.txt, or frames", f"none of these in {labels_dir}")
+    if not with_results:
+        raise InputError("results", f"result files such as {frame_ids[0]}.txt", f"none of these in {results_dir}")
+    if unknown := [frame_id for frame_id in frame_ids if frame_id not in labels]:
+        raise InputError("labels", f"labels of frame {unknown[0]}, which the split names", "none")
+    pairs = [
+        (read_objects(labels[frame_id]), _results(results[frame_id]) if frame_id in results else [])
+        for frame_id in frame_ids
+    ]
+    return replace(
+        score_frames(pairs, object_type),
+        num_frames_without_results=len(frame_ids) - len(with_results),
+        num_result_frames_unused=len(results) - len(with_results),
+    )
 
-    Example: one car, found with perfect overlap.
+
+def score_frames(
+    frames: Sequence[tuple[Sequence[KittiObject], Sequence[KittiObject]]], object_type: str = "Car"
+) -> KittiScores:
+    """Score the detections of some frames, each its labels and its results with scores, as `evaluate_kitti` does.
+
+    Examples:
         >>> from directshape_torch.io.kitti_labels import parse_object
         >>> from directshape_torch.files.read_files import Line
         >>> text = "Car 0 0 0 100 100 200 180 1.5 1.6 3.9 1 1.6 20 0"
         >>> label, result = (parse_object("a file", Line(1, t, t)) for t in (text, text + " 0.9"))
-        >>> evaluate_kitti({"000007": [label]}, {"000007": [result]}).score("3d", 0.7, "easy").ap_area
+        >>> score_frames([([label], [result])]).score("3d", 0.7, "easy").ap_area
         100.0
     """
-    of_labels, of_results = _source(labels, "labels"), _source(results, "results")
-    listed = [line.text for line in read_lines(split)] if isinstance(split, (Path, str)) else split
-    frame_ids = sorted(of_labels) if listed is None else list(dict.fromkeys(listed))
-    with_results = [frame_id for frame_id in frame_ids if frame_id in of_results]
-    if not frame_ids:
-        raise InputError("labels", "label files NNNNNN.txt, or a split that is not empty", _described(labels))
-    if not with_results:
-        raise InputError("results", f"result files such as {frame_ids[0]}.txt", _described(results))
-    frames = [(_labels_of(of_labels, frame_id), _results_of(of_results, frame_id)) for frame_id in frame_ids]
     scene = KittiScene(frames, object_type)
-    return KittiScores(
-        object_type=object_type,
-        num_frames=len(frame_ids),
-        num_frames_without_results=len(frame_ids) - len(with_results),
-        num_result_frames_unused=len(of_results) - len(with_results),
-        num_detections=int((scene.detections.kind == scene.kind).sum()),
-        scores=tuple(
-            _score(scene, metric, minimum_iou, difficulty)
-            for metric in get_args(Metric)
-            if metric == "2d" or scene.has_box_3d
-            for minimum_iou in MINIMUM_IOUS
-            for difficulty in DIFFICULTIES
-        ),
+    scores = tuple(
+        _score(scene, metric, minimum_iou, difficulty)
+        for metric in get_args(Metric)
+        if metric == "2d" or scene.has_box_3d
+        for minimum_iou in MINIMUM_IOUS
+        for difficulty in DIFFICULTIES
     )
+    return KittiScores(object_type, len(frames), int((scene.detections.kind == scene.kind).sum()), scores)
 
 
 def _score(scene: KittiScene, metric: Metric, minimum_iou: float, difficulty: Difficulty) -> ApScore:
@@ -137,37 +148,18 @@ def _percent(samples: Floats) -> float:
     return float(100 * samples.sum() / len(samples))
 
 
-def _source(given: Path | str | ObjectsByFrame, name: str) -> Mapping[str, Path | Sequence[KittiObject]]:
-    """Where the objects of each frame are: files of a folder, or the objects themselves."""
-    if isinstance(given, Mapping):
-        return given
-    if not Path(given).is_dir():
-        raise DataFormatError(given, f"is no folder of {name}", cure="give the folder that holds the files NNNNNN.txt")
-    return files_of_frames(Path(given))
+def _files(folder: Path | str, name: str) -> dict[str, Path]:
+    if not Path(folder).is_dir():
+        raise DataFormatError(folder, f"is no folder of {name}", cure="give the folder that holds the files NNNNNN.txt")
+    return files_of_frames(Path(folder))
 
 
-def _labels_of(source: Mapping[str, Path | Sequence[KittiObject]], frame_id: str) -> Sequence[KittiObject]:
-    if frame_id not in source:
-        raise InputError("labels", f"labels of frame {frame_id}, which the split names", "none")
-    return _objects(source[frame_id])
-
-
-def _results_of(source: Mapping[str, Path | Sequence[KittiObject]], frame_id: str) -> Sequence[KittiObject]:
-    found = source.get(frame_id, ())
-    objects = _objects(found)
-    for o in objects:
-        if o.score is None:
-            where = found if isinstance(found, Path) else f"results of frame {frame_id}"
+def _results(path: Path) -> list[KittiObject]:
+    objects = read_objects(path)
+    for each in objects:
+        if each.score is None:
             cure = "results are ranked by their score: write it as column 16"
             raise DataFormatError(
-                where, "a result without score", line_number=o.line_number, line=o.raw_line, cure=cure
+                path, "a result without score", line_number=each.line_number, line=each.raw_line, cure=cure
             )
     return objects
-
-
-def _objects(found: Path | Sequence[KittiObject]) -> Sequence[KittiObject]:
-    return read_objects(found) if isinstance(found, Path) else found
-
-
-def _described(given: Path | str | ObjectsByFrame) -> str:
-    return f"objects of {len(given)} other frames" if isinstance(given, Mapping) else f"none of these in {given}"

@@ -10,7 +10,7 @@ import pytest
 from helpers.kitti_lines import evaluate, line, objects, precision
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.evaluation.kitti_ap import evaluate_kitti
+from directshape_torch.evaluation.kitti_ap import evaluate_kitti, score_frames
 from directshape_torch.evaluation.kitti_rules import score_thresholds
 
 DIFFICULTIES = ("easy", "moderate", "hard")
@@ -91,20 +91,16 @@ class TestCurve:
 
     def test_half_found(self) -> None:
         """40 of 80: thresholds at recall 0, 1/40 .. 20/40, where precision is 1: 6 of 11 and 20 of 40 points."""
-        labels = {str(k): objects(line()) for k in range(80)}
-        results = {str(k): objects(line(score=k)) for k in range(40)}
-        scores = evaluate_kitti(labels, results)
-        score = scores.score("3d", 0.7, "easy")
-        assert scores.num_frames_without_results == 40
+        frames = [(objects(line()), objects(line(score=k)) if k < 40 else []) for k in range(80)]
+        score = score_frames(frames).score("3d", 0.7, "easy")
         assert (score.ap_r11, score.ap_r40, score.ap_area) == pytest.approx((600 / 11, 50, 50))
 
 
 class TestOrientation:
     @pytest.mark.parametrize(("off_by", "percent"), [(0, 100), (math.pi / 3, 75), (math.pi / 2, 50), (math.pi, 0)])
     def test_all_off_by_the_same_angle(self, off_by: float, percent: float) -> None:
-        labels = {str(k): objects(line(alpha=1)) for k in range(41)}
-        results = {str(k): objects(line(alpha=1 - off_by, score=k)) for k in range(41)}
-        score = evaluate_kitti(labels, results).score("2d", 0.7, "easy")
+        frames = [(objects(line(alpha=1)), objects(line(alpha=1 - off_by, score=k))) for k in range(41)]
+        score = score_frames(frames).score("2d", 0.7, "easy")
         assert (score.ap_r40, score.aos_r11, score.aos_r40) == pytest.approx((100, percent, percent))
 
     def test_it_belongs_to_image_boxes(self) -> None:
@@ -156,4 +152,4 @@ class TestFilesAndErrors:
 
     def test_a_split_with_a_frame_that_has_no_labels(self, folders: tuple[Path, Path]) -> None:
         with pytest.raises(InputError, match="labels of frame 000009, which the split names"):
-            evaluate_kitti(*folders, split=["000001", "000009"])
+            evaluate_kitti(*folders, frames=[1, "000009"])

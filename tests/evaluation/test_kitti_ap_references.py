@@ -14,7 +14,7 @@ from helpers.kitti_lines import objects
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from directshape_torch.evaluation.kitti_ap import evaluate_kitti
+from directshape_torch.evaluation.kitti_ap import evaluate_kitti, score_frames
 from directshape_torch.io.kitti_labels import KittiObject
 
 
@@ -44,9 +44,7 @@ def scenes(draw: st.DrawFn) -> list[tuple[list[KittiObject], list[KittiObject]]]
 @settings(max_examples=25)
 @given(scenes())
 def test_equals_the_devkit_taken_frame_by_frame(frames: list[tuple[list[KittiObject], list[KittiObject]]]) -> None:
-    labels = {str(k): frame[0] for k, frame in enumerate(frames)}
-    results = {str(k): frame[1] for k, frame in enumerate(frames)}
-    for score in evaluate_kitti(labels, results).scores:
+    for score in score_frames(frames).scores:
         expected, orientation = devkit_curves(frames, score.metric, score.minimum_iou, score.difficulty)
         np.testing.assert_allclose(score.curve.precision, expected, atol=1e-12)
         if score.metric == "2d":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from directshape_torch.evaluation.kitti_ap import ApScore, KittiScores, evaluate_kitti
+from directshape_torch.evaluation.kitti_ap import ApScore, KittiScores, score_frames
 from directshape_torch.files.read_files import Line
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
 
@@ -35,7 +35,7 @@ def objects(*lines: str) -> list[KittiObject]:
 
 def evaluate(labels: list[str], results: list[str], object_type: str = "Car") -> KittiScores:
     """The scores of one frame."""
-    return evaluate_kitti({"0": objects(*labels)}, {"0": objects(*results)}, object_type=object_type)
+    return score_frames([(objects(*labels), objects(*results))], object_type)
 
 
 def precision(score: ApScore, count: int) -> list[float]:
