@@ -62,7 +62,7 @@ def refine_dataset(
         DirectShapeError: the run cannot go on: the disk is full, workers die before they finish anything.
     """
     out_dir, options = Path(out_dir), options or RefineOptions()
-    _check_out_dir(dataset, out_dir)
+    check_out_dir(dataset, out_dir)
     with RunLog(out_dir) as log, limited_threads(options.threads if options.workers is None else None):
         remove_unfinished_files(out_dir)
         is_cleared = fresh and remove_results(out_dir)
@@ -236,7 +236,8 @@ def package_version() -> str:
         return "not installed"
 
 
-def _check_out_dir(dataset: StereoDataset, out_dir: Path) -> None:
+def check_out_dir(dataset: StereoDataset, out_dir: Path) -> None:
+    """Raise `InputError` where the folder would overwrite the detections, or a folder in it is a link."""
     for link in (out_dir / name for name in OUTPUT_FOLDERS if (out_dir / name).is_symlink()):
         cure = "remove the link; the output folder itself may be one"
         raise InputError("out", "folders of its own in it, where results are written and removed", f"link {link}", cure)

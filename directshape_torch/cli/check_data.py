@@ -22,7 +22,7 @@ from directshape_torch.scene_check.finding import CheckReport, unreadable
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The data set, and how much of it is read."""
-    add_data_options(parser.add_argument_group("input"), with_disparity=False)
+    add_data_options(parser.add_argument_group("input"))
     group = parser.add_argument_group("extent and output")
     group.add_argument(
         "--max-frames",

@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+from directshape_torch.batch.refine_dataset import package_version
 from directshape_torch.errors import DirectShapeError
 
 EXIT_WRONG_INPUT = 2
@@ -108,7 +109,7 @@ def _output_was_closed() -> bool:
 def make_parser() -> argparse.ArgumentParser:
     """The parser of the program with all of its commands."""
     parser = argparse.ArgumentParser(prog="directshape", description=_DESCRIPTION)
-    parser.add_argument("--version", action=_Version, help="print the version and stop")
+    parser.add_argument("--version", action="version", version=package_version())
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND")
     for name in COMMANDS:
         module = importlib.import_module(f"directshape_torch.cli.{name}")
@@ -118,19 +119,6 @@ def make_parser() -> argparse.ArgumentParser:
         module.add_options(command)
         command.set_defaults(run=module.run)
     return parser
-
-
-class _Version(argparse.Action):
-    """Looks the version up only when it is asked for."""
-
-    def __init__(self, option_strings: Sequence[str], dest: str, help: str | None = None) -> None:
-        super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, help=help)
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from directshape_torch.batch.refine_dataset import package_version
-
-        print(package_version())
-        parser.exit()
 
 
 if __name__ == "__main__":

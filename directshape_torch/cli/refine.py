@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import get_args
 
 from directshape_torch.batch.options import MeshFormat, RefineOptions
-from directshape_torch.batch.refine_dataset import refine_dataset
+from directshape_torch.batch.refine_dataset import check_out_dir, refine_dataset
 from directshape_torch.batch.run_summary import format_summary
 from directshape_torch.cli.options import (
     add_data_options,
@@ -112,6 +112,7 @@ def run(args: argparse.Namespace) -> int:
             "--disparity", "a method that uses it", refiner.config.method, "add --method geometric or combined"
         )
     dataset = dataset_of(args)
+    check_out_dir(dataset, args.out)
     refiner.config = _warned_of(dataset, refiner.config)
     rigs, are_new = _rigs_of_run(dataset, args.rig, args.out, args.fresh)
     if rigs:

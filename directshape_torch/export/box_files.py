@@ -96,6 +96,8 @@ _INFO = {
 class Coco3dExporter(Exporter):
     """`coco3d.json`: all frames, written at the end."""
 
+    needs_images_for = "the sizes and intrinsics that coco3d lists"
+
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
         self.image_ids = image_numbers(self.run.frame_ids)
@@ -104,7 +106,7 @@ class Coco3dExporter(Exporter):
         self.annotations: list[dict[str, Any]] = []
 
     def add(self, source: FrameSource) -> None:
-        frame = source.with_images("the sizes and intrinsics that coco3d lists").frame
+        frame = source.with_images.frame
         height, width = frame.sizes[0].tolist()
         K_left, t_cam_ref = (x[0].double().numpy() for x in (frame.camera.K_left, frame.camera.t_cam_ref))
         image = {"id": self.image_ids[source.frame_id], "dataset_id": 0, "width": width, "height": height}

@@ -53,14 +53,10 @@ class FrameSource:
         """Images, calibration and masks, or None where no data set was given."""
         return None if self.inputs.dataset is None else self.inputs.dataset.load(self.frame_id)
 
-    def with_images(self, purpose: str) -> LoadedFrame:
-        """Images, calibration and masks.
-
-        Raises:
-            InputError: no data set was given.
-        """
-        if self.loaded is None:
-            raise InputError("--data", f"the data set of the run, for {purpose}", "nothing")
+    @property
+    def with_images(self) -> LoadedFrame:
+        """The same, for an exporter that asked for a data set."""
+        assert self.loaded is not None, "no data set"
         return self.loaded
 
     @cached_property
@@ -76,9 +72,17 @@ class FrameSource:
 
 
 class Exporter:
-    """Writes a run in one format, below a folder."""
+    """Writes a run in one format, below a folder.
+
+    Raises:
+        InputError: what needs images has no data set.
+    """
+
+    needs_images_for = ""  # what the images are for, where it cannot do without
 
     def __init__(self, folder: Path, run: RunFolder, inputs: ExportInputs) -> None:
+        if self.needs_images_for and inputs.dataset is None:
+            raise InputError("--data", f"the data set of the run, for {self.needs_images_for}", "nothing")
         self.folder, self.run, self.inputs = folder, run, inputs
 
     def add(self, source: FrameSource) -> None:

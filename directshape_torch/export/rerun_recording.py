@@ -61,6 +61,8 @@ class RerunExporter(Exporter):
         MissingDependencyError: Rerun is not installed.
     """
 
+    needs_images_for = "the pictures of a recording"
+
     def __init__(self, *args: Any) -> None:
         _import_rerun()
         super().__init__(*args)
@@ -68,7 +70,7 @@ class RerunExporter(Exporter):
         self._stream: _Stream | None = None
 
     def add(self, source: FrameSource) -> None:
-        loaded, refiner = source.with_images("the pictures of a recording"), self.inputs.refiner
+        loaded, refiner = source.with_images, self.inputs.refiner
         if self._stream is None:
             # The images of the first frame say what the viewer's views are fitted to.
             height, width = loaded.frame.sizes[0].tolist()

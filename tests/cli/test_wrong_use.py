@@ -50,6 +50,7 @@ CASES = [
     (f"{PRIOR} --spacing 3", "--spacing"),
     (REFINE, "--masks: expected either a folder"),
     (f"{MASKED} --masks-left x.json", "got both"),
+    (REFINE.replace("--out {out}", "--out {root}/detections --masks {root}/masks"), "it would overwrite its own input"),
     (f"{MASKED} --threads 0", "threads: expected at least 1, got 0"),
     (f"{MASKED} --lidar nowhere", "nowhere: is no folder of LiDAR scans"),
     (f"{MASKED} --disparity x", "--disparity: expected a method that uses it, got direct; add --method"),
@@ -77,4 +78,5 @@ def test_one_line_says_it(
     line = shown.err.splitlines()[-1]
     assert line.startswith("directshape: error: ")
     assert said in line
+    assert words.startswith(("build-prior", "inspect")) or len(shown.err.splitlines()) == 1, "work before its error"
     assert not list(tmp_path.iterdir())
