@@ -11,7 +11,7 @@ on to the root of the gradient, as the implicit modes need it. All is float64.
     python scripts/check_backward.py --out backward
     python scripts/check_backward.py --scene street --option default "silhouette.form=product" --mode implicit
 
-Printed, and written as `backward.md`: the tables of docs/gradients.md.
+Printed, and written as `backward.md`: what docs/gradients.md sums up.
 """
 
 from __future__ import annotations
@@ -247,7 +247,7 @@ def _by_mode(scene: Scene, settings: Sequence[str], mode: str) -> Tensor | None:
 
 
 def as_markdown(rows: Sequence[Row]) -> str:
-    """The table of docs/gradients.md: median / largest error of the box, and of the other inputs."""
+    """A table behind docs/gradients.md: median / largest error of the box, and of the other inputs."""
     header = ("option", "pairs", "at jumps", *rows[0].gradients)
     lines = [header, ("---",) * len(header), *(row.cells() for row in rows)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
