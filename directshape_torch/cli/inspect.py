@@ -21,31 +21,28 @@ from directshape_torch.cli.progress import Bar
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.matching import match_to_labels
 from directshape_torch.files.atomic_files import write_png
-from directshape_torch.io.figure_files import check_figures, write_animation
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.kitti_labels import box_corners_cam
 from directshape_torch.io.result_files import track_name
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.visualize.car_figures import (
-    write_drift_figure,
-    write_iteration_animation,
-    write_residual_figure,
-    write_sampling_figure,
+    CarCourse,
+    drift_figure,
+    iteration_frames,
+    residual_figure,
+    sampling_figure,
 )
-from directshape_torch.visualize.car_view import CarView
-from directshape_torch.visualize.drawing import Picture, View, draw_box, draw_contour, draw_text
+from directshape_torch.visualize.drawing import Picture, View, draw_box, draw_contour, titled, write_gif
 from directshape_torch.visualize.drawn_car import DrawnCar, drawn_cars
 from directshape_torch.visualize.overlay import overlay_of_frame
 from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement, without_photometry
 
-_SIZE_PX = (480, 360)
-_SECONDS_A_FRAME = 0.4
-_MARGIN = 1.3
-_FIGURES: dict[str, Callable[[Path, CarView], None]] = {
-    "sampling.png": write_sampling_figure,
-    "residuals.png": write_residual_figure,
-    "iterations.gif": write_iteration_animation,
+_SIZE_PX = (480, 334)
+_SECONDS_A_FRAME, _SECONDS_AT_END = 0.4, 2.5
+_FIGURES: dict[str, Callable[[CarCourse], Picture]] = {
+    "sampling.png": sampling_figure,
+    "residuals.png": residual_figure,
 }
 
 
@@ -63,7 +60,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draw what the options ask for."""
-    check_figures("directshape inspect")
     dataset = _dataset(args)
     # One frame is not worth a compilation, and pictures need no graphics card.
     refiner = make_refiner(args.config, ["compile=off", *args.set], args.prior, "cpu")
@@ -126,11 +122,13 @@ def inspect_frame(
     silhouettes = silhouette_trace(refiner, loaded) if drawn else None
     truth = true_corners_cam(loaded)
     for row in Bar(drawn, unit="car", desc=f"frame {loaded.frame_id}", file=sys.stderr):
-        folder, view = out_dir / f"{loaded.frame_id}_{line_of(loaded, row)}", CarView(loaded, trace, row, truth[row])
-        for name, write in _FIGURES.items():
-            write(folder / name, view)
+        folder, car = out_dir / f"{loaded.frame_id}_{line_of(loaded, row)}", CarCourse(loaded, trace, row, truth[row])
+        for name, figure in _FIGURES.items():
+            write_png(folder / name, figure(car))
+        write_gif(folder / "iterations.gif", iteration_frames(car), _SECONDS_A_FRAME, _SECONDS_AT_END)
         if silhouettes is not None and silhouettes.place_of(row) >= 0:
-            write_drift_figure(folder / "drift.png", view, CarView(loaded, silhouettes, row, truth[row]))
+            drift = drift_figure(car, CarCourse(loaded, silhouettes, row, truth[row]))
+            write_png(folder / "drift.png", drift)
 
 
 def silhouette_trace(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> RefinementTrace | None:
@@ -185,22 +183,15 @@ def inspect_tracks(loaded: Sequence[LoadedFrame], refiner: DirectShapeRefiner, o
     for name, frames in pictures.items():
         if name and len(frames) > 1:
             paths.append(out_dir / f"track_{name}.gif")
-            write_animation(paths[-1], frames, [_SECONDS_A_FRAME] * len(frames))
+            write_gif(paths[-1], frames, _SECONDS_A_FRAME, _SECONDS_A_FRAME)
     return paths
 
 
 def _picture(item: LoadedFrame, car: DrawnCar) -> Picture:
     """The car's part of the left image, with its box and contour; all of one size."""
     image = View.of_frame(item.frame)
-    ahead = car.corners_cam[car.corners_cam[:, 2] > 0.5]
-    pixels = image.project(ahead if len(ahead) else np.array([[0.0, 0.0, 1.0]]))
-    (u0, v0), (u1, v1) = pixels.min(axis=0), pixels.max(axis=0)
-    height = round(max(_MARGIN * (v1 - v0), _MARGIN * (u1 - u0) * _SIZE_PX[1] / _SIZE_PX[0], 12.0) / 3) * 3
-    width = height * 4 // 3
-    left, top = round((u0 + u1 - width) / 2), round((v0 + v1 - height) / 2)
-    view = image.part((left, top, left + width, top + height), _SIZE_PX[0] / width)
+    view = image.around(car.corners_cam, _SIZE_PX) or View(np.zeros((*_SIZE_PX[::-1], 3), np.uint8), image.P)
     draw_box(view, car.corners_cam, car.colour)
     if car.surface is not None:
         draw_contour(view, car.surface, car.colour)
-    draw_text(view.picture, f"{item.frame_id}: {car.distance_m:.1f} m, {car.status}", (8, 20))
-    return view.picture
+    return titled(view.picture, f"{item.frame_id}: {car.distance_m:.1f} m, {car.status}")

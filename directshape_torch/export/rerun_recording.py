@@ -5,12 +5,10 @@ from __future__ import annotations
 import colorsys
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from directshape_torch.errors import MissingDependencyError
@@ -24,17 +22,10 @@ from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observation.extents import MASK_THRESHOLD
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
-from directshape_torch.status import Status
 from directshape_torch.stereo_matching.disparity import rgb8
-from directshape_torch.visualize.car_figures import WORST_SILHOUETTE
-from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Colour, blue_white_red
-from directshape_torch.visualize.refinement_trace import (
-    CarResiduals,
-    PixelResiduals,
-    RefinementTrace,
-    car_residuals,
-    trace_refinement,
-)
+from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Colour
+from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
+from directshape_torch.visualize.residuals import CarResiduals, photometric_colours, silhouette_colours
 
 if TYPE_CHECKING:
     import trimesh
@@ -47,8 +38,6 @@ _RESIDUALS = f"{_LEFT}/silhouette", f"{_RIGHT}/silhouette", f"{_LEFT}/photometri
 _JPEG_QUALITY = 90
 _MASK_OPACITY = 0.35
 _MOST_LINES = 255
-_WORST_GREY_LEVELS = 30.0
-_LOST_RGB = (130, 130, 130)
 _DOT_PX = 1.6
 # Not the colour of the boxes that the run ended with.
 _STATE_RGB = (120, 220, 235)
@@ -102,7 +91,7 @@ class RerunExporter(Exporter):
             stream.at(iteration=self.iteration + number)
             log.log_state(number)
         stream.at(frame)
-        for car, residuals in car_residuals(trace, len(trace) - 1).items():
+        for car, residuals in trace.residuals(len(trace) - 1).items():
             log.log_residuals(car, residuals)
         self.iteration += len(trace)
 
@@ -189,7 +178,7 @@ class _IterationLog:
         """Surfaces, boxes, residuals and costs of all cars in a state; what a car shares with the one before stays."""
         self._log_boxes(number)
         moved = [car for car in self.cars if number in self.trace.steps_of(car)]
-        residuals = car_residuals(self.trace, number) if moved else {}
+        residuals = self.trace.residuals(number) if moved else {}
         state, prior = self.trace.states[number], self.trace.result.prior
         for car in self.cars:
             if car in moved:
@@ -201,7 +190,8 @@ class _IterationLog:
 
     def log_residuals(self, car: int, residuals: CarResiduals) -> None:
         """Sampled pixels coloured by what they cost: silhouettes in both images, photometry in the left one."""
-        for name, values, colours in zip(_RESIDUALS, residuals, (_heat, _heat, _blue_red), strict=True):
+        for name, values in zip(_RESIDUALS, residuals, strict=True):
+            colours = photometric_colours if values is residuals.photometric else silhouette_colours
             # Rerun's pixels have their corners at whole numbers, ours their centres.
             dots = self.stream.rr.Points2D(values.uv + 0.5, colors=colours(values), radii=_DOT_PX)
             self.stream.log(f"{name}/{self.line(car)}", dots)
@@ -215,28 +205,11 @@ class _IterationLog:
 
     def _log_boxes(self, number: int) -> None:
         """Boxes measured on the zero level of the state, as those of a result are."""
-        state, rows = self.trace.states[number], self.trace.rows
-        # A result shows the detector's box of a car that it gives its input back; here is what was tried.
-        status = torch.full_like(self.trace.result.status_code, Status.converged.code)
-        T_cam_obj = se3.inverse(state.T_obj_cam)
-        then = replace(self.trace.result, T_cam_obj=T_cam_obj, code=state.code, status_code=status).boxes()
+        then, rows = self.trace.moment(number).boxes(), self.trace.rows
         location_cam = (then.location_ref + self.trace.result.t_cam_ref)[rows].double().cpu()
         T_cam_box = pose_from_kitti(location_cam, then.rotation_y[rows].double().cpu()).numpy()
         hwl, labels = then.dimensions_hwl[rows].double().cpu().numpy(), [f"{self.line(car)}" for car in self.cars]
         self.stream.log_boxes("world/boxes/iteration", T_cam_box, hwl, [_STATE_RGB] * len(labels), labels)
-
-
-def _heat(values: PixelResiduals) -> NDArray[np.uint8]:
-    """Black where nothing is wrong, over red to yellow where the mask is certain and wrong."""
-    share = np.clip(values.value / WORST_SILHOUETTE, 0, 1)[:, None]
-    return np.asarray((255 * np.clip(share * [2.0, 2.0, 0.0] - [0.0, 1.0, 0.0], 0, 1)).astype(np.uint8))
-
-
-def _blue_red(values: PixelResiduals) -> NDArray[np.uint8]:
-    """Blue where the right image is darker, white where they agree, red where it is brighter; grey where lost."""
-    colours: NDArray[Any] = blue_white_red(values.value, _WORST_GREY_LEVELS).astype(np.uint8)
-    colours[values.lost] = _LOST_RGB
-    return colours
 
 
 def _import_rerun() -> Any:

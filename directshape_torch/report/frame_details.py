@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -16,24 +15,13 @@ from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.result_files import ShapeArrays
 from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.observation.occlusion import occlusion_map
 from directshape_torch.report.page_parts import FRAME_QUALITY, data_url, mesh_data, numbers
-from directshape_torch.report.residual_maps import photometric_picture, residual_maps, silhouette_picture
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.visualize.drawing import (
-    ORANGE,
-    Surface,
-    View,
-    Window,
-    draw_box,
-    draw_contour,
-    window_around,
-)
+from directshape_torch.visualize.drawing import Surface, View, draw_box, draw_contour
 from directshape_torch.visualize.drawn_car import DrawnCar, cars_after, cars_before, corners_cam, true_corners
+from directshape_torch.visualize.residuals import ResidualMaps, draw_residuals
 
-_WIDTH_PX = 260
-_LARGEST_SCALE = 4.0
-_LEAST_ASPECT = 1.2
+_THUMBNAIL_PX = (360, 240)
 
 
 @dataclass(frozen=True)
@@ -66,13 +54,11 @@ def frame_details(material: FrameMaterial, settings: DetailSettings) -> dict[str
     after = _cars_after(material.result, t_cam_ref, before, settings.prior)
     cars = [{"after": now} if before is None else {"before": before[k], "after": now} for k, now in enumerate(after)]
     view = None if material.loaded is None else View.of_frame(material.loaded.frame)
-    windows = [None if view is None else _window(view, list(states.values())) for states in cars]
+    parts = [_part(view, states) for states in cars]
+    maps = _maps(parts, material.loaded, settings, cars)
     return {
-        "thumbnails": [_thumbnails(view, window, states) for window, states in zip(windows, cars, strict=True)],
-        "maps": [
-            {**_figures(shapes, car), "pictures": _maps(view, material.loaded, settings, car, window, states)}
-            for car, (window, states) in enumerate(zip(windows, cars, strict=True))
-        ],
+        "thumbnails": [_thumbnails(part, states) for part, states in zip(parts, cars, strict=True)],
+        "maps": [{**_figures(shapes, car), "pictures": pictures} for car, pictures in enumerate(maps)],
         "scene": {
             **_background(view, material.loaded),
             "ground_source": shapes.ground_source,
@@ -105,30 +91,22 @@ def _t_cam_ref(shapes: ShapeArrays) -> Tensor:
     return torch.from_numpy(np.median(offset, axis=0))
 
 
-def _window(view: View, states: Sequence[DrawnCar]) -> Window | None:
+def _part(view: View | None, states: dict[str, DrawnCar]) -> View | None:
     """The part of the image that shows a car in all of its states, or None where it shows none."""
-    bounds = view.bounds(np.concatenate([state.corners_cam for state in states]))
-    if bounds is None:
-        return None
-    tall = 1.2 * (bounds[3] - bounds[1]) + 1
-    u0, v0, u1, v1 = window_around(bounds, max(1.2 * (bounds[2] - bounds[0]) + 4, _LEAST_ASPECT * tall), tall)
-    height, width = view.picture.shape[:2]
-    return max(u0, 0), max(v0, 0), min(u1, width), min(v1, height)
+    corners_cam = np.concatenate([state.corners_cam for state in states.values()])
+    return None if view is None else view.around(corners_cam, _THUMBNAIL_PX)
 
 
-def _thumbnails(view: View | None, window: Window | None, states: dict[str, DrawnCar]) -> dict[str, str]:
+def _thumbnails(part: View | None, states: dict[str, DrawnCar]) -> dict[str, str]:
     """Nothing for a car that the image does not show."""
-    if view is None or window is None:
-        return {}
     pictures = {}
-    for name, state in states.items():
-        part = view.part(window, min(_WIDTH_PX / (window[2] - window[0]), _LARGEST_SCALE))
-        colour, surface = ORANGE if name == "before" else state.colour, state.surface
-        if surface is None:
-            draw_box(part, state.corners_cam, colour)
+    for name, state in states.items() if part is not None else ():
+        view = part.copy()
+        if state.surface is None:
+            draw_box(view, state.corners_cam, state.colour)
         else:
-            draw_contour(part, surface, colour, 2)
-        pictures[name] = data_url(part.picture)
+            draw_contour(view, state.surface, state.colour, 2)
+        pictures[name] = data_url(view.picture)
     return pictures
 
 
@@ -146,37 +124,28 @@ def _figures(shapes: ShapeArrays, car: int) -> dict[str, Any]:
 
 
 def _maps(
-    view: View | None,
+    parts: Sequence[View | None],
     loaded: LoadedFrame | None,
     settings: DetailSettings,
-    car: int,
-    window: Window | None,
-    states: dict[str, DrawnCar],
-) -> dict[str, str]:
-    """Maps by the names "photometric_before" and so on, where images and shapes are at hand."""
-    if view is None or loaded is None or settings.prior is None or window is None:
-        return {}
-    detections, config = loaded.detections, settings.config
-    foreground = detections.mask_left[car].float().numpy() if bool(detections.has_mask_left[car]) else None
-    hidden = _hidden(loaded, car, window, config)
-    pictures = {}
-    for name, state in states.items():
-        photometric, silhouette = residual_maps(
-            loaded.frame, settings.prior, state.T_cam_obj, state.code, window, foreground, hidden, config
-        )
-        pictures[f"photometric_{name}"] = data_url(photometric_picture(view.picture, window, photometric))
-        if silhouette is not None:
-            pictures[f"silhouette_{name}"] = data_url(silhouette_picture(view.picture, window, silhouette))
+    cars: Sequence[dict[str, DrawnCar]],
+) -> list[dict[str, str]]:
+    """Maps of each car by the names "photometric_before" and so on, where images, masks and shapes are at hand."""
+    pictures: list[dict[str, str]] = [{} for _ in cars]
+    rows = [row for row, states in enumerate(cars) if states["after"].is_refined and parts[row] is not None]
+    if loaded is None or settings.prior is None or not rows:
+        return pictures
+    maps = ResidualMaps(loaded, settings.prior, settings.config, torch.tensor(rows))
+    for name in cars[rows[0]]:
+        states = [cars[row][name] for row in rows]
+        found = maps.of(np.stack([car.T_cam_obj for car in states]), np.stack([car.code for car in states]))
+        for row, residuals in zip(rows, found, strict=True):
+            for kind, key in (("photometric", "photometric"), ("silhouette_left", "silhouette")):
+                part = parts[row]
+                if part is not None and len(getattr(residuals, kind).uv):
+                    view = part.copy()
+                    draw_residuals(view, residuals, kind)
+                    pictures[row][f"{key}_{name}"] = data_url(view.picture)
     return pictures
-
-
-def _hidden(loaded: LoadedFrame, car: int, window: Window, config: RefinerConfig) -> npt.NDArray[np.bool_]:
-    """(H, W), true where an instance in front of the car covers a pixel of the window."""
-    u0, v0, u1, v1 = window
-    hidden = torch.zeros(loaded.detections.mask_left.shape[1:], dtype=torch.bool)
-    occluders = occlusion_map(loaded.detections, "left", config.sampling.occlusion_order)
-    hidden[v0:v1, u0:u1] = occluders.window(car, window)
-    return np.asarray(hidden.numpy())
 
 
 def _background(view: View | None, loaded: LoadedFrame | None) -> dict[str, Any]:

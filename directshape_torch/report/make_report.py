@@ -131,7 +131,7 @@ def _notes(
     if not reader.has_detections:
         notes.append("nothing from before the refinement: the detections were not given (--detections)")
     if dataset is not None and dataset.masks is None:
-        notes.append("no silhouette residuals: the masks were not given (--masks)")
+        notes.append("no residual maps: the masks were not given (--masks)")
     if prior is None:
         reason = "the prior is not that of the run" if prior_was_given else "the prior was not given"
         notes.append(f"no residual maps, and no meshes but saved ones: {reason} (--prior)")

@@ -1,19 +1,21 @@
-"""Lines, text and projected things on pictures: (h, w, 3) RGB uint8, drawn in place."""
+"""Lines, text, charts and projected things on pictures (h, w, 3), RGB uint8, and pictures put together."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-import torch
-from torch import Tensor
 
+from directshape_torch.errors import InputError
+from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.geometry.box3d import BOX_EDGES
+from directshape_torch.observation.occlusion import Side
 from directshape_torch.scene import FrameBatch
 from directshape_torch.stereo_matching.disparity import rgb8
 
@@ -23,48 +25,88 @@ Colour = tuple[int, int, int]
 Window = tuple[int, int, int, int]
 """A part of an image, half open: u_min, v_min, u_max, v_max."""
 
+# The same everywhere: before, after, truth, not refined; masks are white.
 ORANGE, BLUE, GREEN, GREY = (255, 140, 0), (30, 144, 255), (60, 220, 80), (170, 170, 170)
 WHITE, BLACK = (255, 255, 255), (0, 0, 0)
+GROUND: Colour = (28, 30, 34)
+GRID: Colour = (62, 66, 74)
 
 NEAR_PLANE_M = 0.3
 # OpenCV takes sub-pixel positions as integers with this many binary digits after the point.
 _SHIFT = 4
 # Beyond this OpenCV's fixed-point coordinates would overflow.
 _FARTHEST_PX = 1e5
+_GAP_PX = 6
+# Around a car, as a share of its size; of a far one at least so much is shown.
+_ROOM, _LEAST_TALL_PX = 1.25, 12.0
+_LINE_PX = 26
 
 
 @dataclass(frozen=True)
 class View:
-    """A picture with the intrinsics that its pixels have: an image, or an enlarged part of one."""
+    """A picture with the projection into its pixels: an image, an enlarged part of one, the ground, a chart."""
 
     picture: Picture  # (h, w, 3), drawn in place
-    K: Array  # (3, 3), pixels of the picture
+    P: Array  # (3, 4) from the left camera's frame to homogeneous pixels of the picture
+    from_image: Array = field(default_factory=lambda: np.eye(3))  # (3, 3) from the whole image's pixels to these
 
     @classmethod
-    def of_frame(cls, frame: FrameBatch) -> View:
-        """The left image of a frame."""
-        return cls(rgb8(frame.images_left[0]), frame.camera.K_left[0].double().cpu().numpy())
+    def of_frame(cls, frame: FrameBatch, side: Side = "left") -> View:
+        """An image of a batch of one frame, by the pinhole model."""
+        camera = frame.camera
+        images, K, T = (
+            (frame.images_left, camera.K_left, np.eye(4))
+            if side == "left"
+            else (frame.images_right, camera.K_right, camera.T_right_cam[0].double().cpu().numpy())
+        )
+        return cls(rgb8(images[0]), K[0].double().cpu().numpy() @ T[:3])
 
-    def part(self, window: Window, scale: float) -> View:
-        """A window, enlarged; beyond the picture it is black."""
+    @property
+    def K(self) -> Array:
+        """Intrinsics (3, 3) of a left image or of a part of one."""
+        return self.P[:, :3]
+
+    def copy(self) -> View:
+        """To draw on, where this one shall stay as it is."""
+        return replace(self, picture=self.picture.copy())
+
+    def part(self, window: Window, size_wh: tuple[int, int]) -> View:
+        """A window, brought to a size; beyond the picture it is black."""
         u0, v0, u1, v1 = window
         part = np.zeros((v1 - v0, u1 - u0, 3), np.uint8)
         height, width = self.picture.shape[:2]
         a, b, c, d = max(u0, 0), max(v0, 0), min(u1, width), min(v1, height)
         if c > a and d > b:
             part[b - v0 : d - v0, a - u0 : c - u0] = self.picture[b:d, a:c]
-        size = (max(1, round(scale * (u1 - u0))), max(1, round(scale * (v1 - v0))))
-        picture = cv2.resize(part, size, interpolation=cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA)
-        s_u, s_v = size[0] / (u1 - u0), size[1] / (v1 - v0)
+        s_u, s_v = size_wh[0] / (u1 - u0), size_wh[1] / (v1 - v0)
+        picture = cv2.resize(part, size_wh, interpolation=cv2.INTER_CUBIC if s_u > 1 else cv2.INTER_AREA)
         # Pixel centres are whole numbers: the edge of a picture lies at -0.5.
-        to_view = np.array([[s_u, 0, s_u * (0.5 - u0) - 0.5], [0, s_v, s_v * (0.5 - v0) - 0.5], [0, 0, 1]])
-        return View(np.ascontiguousarray(picture, dtype=np.uint8), to_view @ self.K)
+        to_part = np.array([[s_u, 0, s_u * (0.5 - u0) - 0.5], [0, s_v, s_v * (0.5 - v0) - 0.5], [0, 0, 1]])
+        return View(np.ascontiguousarray(picture, dtype=np.uint8), to_part @ self.P, to_part @ self.from_image)
+
+    def around(self, points_cam: Array, size_wh: tuple[int, int]) -> View | None:
+        """The part that shows points (N, 3) with some room, of that size; None where they are not seen."""
+        bounds = self.bounds(points_cam)
+        if bounds is None:
+            return None
+        (u0, v0, u1, v1), aspect = bounds, size_wh[0] / size_wh[1]
+        tall = max(_ROOM * (v1 - v0), _ROOM * (u1 - u0) / aspect, _LEAST_TALL_PX)
+        height, width = self.picture.shape[:2]
+        left, top = (u0 + u1 - aspect * tall) / 2, (v0 + v1 - tall) / 2
+        # As far as it fits within the picture.
+        left, top = min(max(left, 0), max(width - aspect * tall, 0)), min(max(top, 0), max(height - tall, 0))
+        window = round(left), round(top), round(left + aspect * tall), round(top + tall)
+        return self.part(window, size_wh)
 
     def project(self, points_cam: Array) -> Array:
         """Pixels (N, 2) of points (N, 3); meaningless behind the camera."""
-        pixels = points_cam @ self.K.T
+        pixels = points_cam @ self.P[:, :3].T + self.P[:, 3]
         depth = np.where(pixels[:, 2:] > 0, pixels[:, 2:], 1.0)
         return np.asarray(np.clip(pixels[:, :2] / depth, -_FARTHEST_PX, _FARTHEST_PX))
+
+    def places(self, uv: Array) -> Array:
+        """Pixels (N, 2) of the picture where those of the whole image lie."""
+        return np.asarray(uv @ self.from_image[:2, :2].T + self.from_image[:2, 2])
 
     def bounds(self, points_cam: Array) -> tuple[float, float, float, float] | None:
         """u_min, v_min, u_max, v_max around points as far as they are seen, or None where they are not."""
@@ -89,21 +131,6 @@ class Surface:
         return Surface(self.vertices @ T[:3, :3].T + T[:3, 3], self.faces)
 
 
-def window_around(bounds: tuple[float, float, float, float], wide: float, tall: float) -> Window:
-    """A part of an image of some size with bounds in its middle."""
-    u, v = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
-    return round(u - wide / 2), round(v - tall / 2), round(u + wide / 2), round(v + tall / 2)
-
-
-def pixel_grid(window: Window, columns: int) -> Tensor:
-    """Pixels (h, w, 2) at equal steps over a window, so many in a row."""
-    u0, v0, u1, v1 = window
-    step = (u1 - u0) / columns
-    # Counted in whole numbers: a range of float steps may end on the window's border, outside of the image.
-    u, v = u0 + torch.arange(columns) * step, v0 + torch.arange(math.ceil((v1 - v0) * columns / (u1 - u0))) * step
-    return torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
-
-
 def blue_white_red(values: Array, limit: float) -> Array:
     """Colours (*, 3), 0 .. 255: blue from -limit on, white at 0 and for NaN, red from the limit on."""
     share = np.clip(np.nan_to_num(values) / limit, -1, 1)[..., None]
@@ -112,23 +139,23 @@ def blue_white_red(values: Array, limit: float) -> Array:
 
 
 def draw_contour(view: View, surface: Surface, colour: Colour, thickness: int = 2) -> None:
-    """The outline of the projected shape (what its silhouette term sees); the picture's border is no part of it."""
-    padding = 2 + thickness
-    mask = silhouette_mask(view, surface, padding)
-    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(view.picture, contours, -1, colour, thickness, cv2.LINE_AA, offset=(-padding, -padding))
+    """The outline of the projected shape (what its silhouette term sees)."""
+    draw_outline(view.picture, silhouette_mask(view, surface), colour, thickness)
 
 
-def silhouette_mask(view: View, surface: Surface, padding: int = 0) -> Picture:
-    """Where a triangle of the shape is seen, 255, else 0, (h + 2 padding, w + 2 padding): the picture and a rim.
+def draw_outline(picture: Picture, mask: Picture, colour: Colour, thickness: int = 2) -> None:
+    """The outlines of a mask (h, w) that is not 0; the picture's border is no part of them."""
+    rim = 2 + thickness
+    contours, _ = cv2.findContours(np.pad(mask, rim, mode="edge"), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(picture, contours, -1, colour, thickness, cv2.LINE_AA, offset=(-rim, -rim))
 
-    Triangles that reach behind the camera are left out.
-    """
-    height, width = view.picture.shape[:2]
-    mask = np.zeros((height + 2 * padding, width + 2 * padding), np.uint8)
+
+def silhouette_mask(view: View, surface: Surface) -> Picture:
+    """Where a triangle of the shape is seen, 255, else 0, (h, w); triangles that reach behind the camera are not."""
+    mask = np.zeros(view.picture.shape[:2], np.uint8)
     in_front = surface.vertices[:, 2] > NEAR_PLANE_M
     pixels = np.zeros((len(surface.vertices), 2), np.int32)
-    pixels[in_front] = _fixed_point(view.project(surface.vertices[in_front]) + padding)
+    pixels[in_front] = _fixed_point(view.project(surface.vertices[in_front]))
     # One by one: a common fill would leave what two triangles cover empty.
     for triangle in pixels[surface.faces[in_front[surface.faces].all(axis=1)]]:
         cv2.fillConvexPoly(mask, triangle, 255, cv2.LINE_8, _SHIFT)
@@ -155,13 +182,13 @@ def draw_segment(view: View, first_cam: Array, second_cam: Array, colour: Colour
     if behind.any():
         share = (NEAR_PLANE_M - ends[0, 2]) / (ends[1, 2] - ends[0, 2])
         ends[int(behind.argmax())] = ends[0] + share * (ends[1] - ends[0])
-    first, second = _fixed_point(view.project(ends))
-    cv2.line(view.picture, first.tolist(), second.tolist(), colour, 1, cv2.LINE_AA, _SHIFT)
+    draw_line(view, ends, colour)
 
 
-def draw_polygon(picture: Picture, points_px: Array, colour: Colour, thickness: int = 1) -> None:
-    """A closed line through points (N, 2) in pixels."""
-    cv2.polylines(picture, [_fixed_point(points_px)], True, colour, thickness, cv2.LINE_AA, _SHIFT)
+def draw_line(view: View, points: Array, colour: Colour, thickness: int = 1, *, closed: bool = False) -> None:
+    """A line through projected points (N, 3)."""
+    pixels = _fixed_point(view.project(points))
+    cv2.polylines(view.picture, [pixels], closed, colour, thickness, cv2.LINE_AA, _SHIFT)
 
 
 def draw_text(
@@ -183,15 +210,80 @@ def draw_text(
         cv2.putText(picture, drawable, (u + du, v + dv), cv2.FONT_HERSHEY_SIMPLEX, size, ink, 1, cv2.LINE_AA)
 
 
-def draw_legend(picture: Picture, entries: Sequence[tuple[str, Colour]], position: tuple[int, int]) -> None:
-    """Coloured strokes with their meaning, one a line, from the upper left corner on."""
-    u, v = position
-    picture[v - 6 : v + 36 * len(entries) + 6, u - 6 : u + 273] //= 3
-    for row, (text, colour) in enumerate(entries):
-        middle = v + 36 * row + 18
-        for ink, thickness in ((BLACK, 5), (colour, 3)):
-            cv2.line(picture, (u, middle), (u + 22, middle), ink, thickness, cv2.LINE_AA)
-        draw_text(picture, text, (u + 30, middle + 10), WHITE, 0.9)
+def draw_legend(
+    picture: Picture, entries: Mapping[str, Colour], position: tuple[int, int], across: bool = False
+) -> None:
+    """Coloured strokes with their meaning, one a line or side by side, from the upper left corner on."""
+    (u, v), widths = position, [cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.7, 1)[0][0] + 48 for text in entries]
+    wide, lines = (sum(widths), 1) if across else (max(widths), len(entries))
+    picture[v : v + _LINE_PX * lines + 4, u : u + wide] //= 3
+    for (text, colour), step in zip(entries.items(), widths, strict=True):
+        cv2.line(picture, (u + 6, v + 15), (u + 28, v + 15), colour, 3, cv2.LINE_AA)
+        draw_text(picture, text, (u + 36, v + 21), WHITE, 0.7)
+        u, v = (u + step, v) if across else (u, v + _LINE_PX)
+
+
+def curves(series: Mapping[str, tuple[Array, Colour]], title: str, size_wh: tuple[int, int], now: int = -1) -> Picture:
+    """Lines over the numbers 0, 1, .. of iterations from a value of 0 on, each named in its colour; a mark at `now`."""
+    (width, height), left, top, low = size_wh, 70, 44, 56
+    most = max(1e-9, *(float(values.max()) for values, _ in series.values()))
+    last = max(1, *(len(values) - 1 for values, _ in series.values()))
+    per_x, per_y = (width - left - 20) / last, (height - top - low) / most
+    to_pixels = [[per_x, 0, 0, left], [0, -per_y, 0, height - low], [0, 0, 0, 1]]
+    chart = View(np.full((height, width, 3), GROUND, np.uint8), np.array(to_pixels))
+    for share in (0.0, 0.5, 1.0):
+        draw_line(chart, np.array([[0, share * most, 0], [last, share * most, 0]]), GRID)
+        draw_text(chart.picture, f"{share * most:.3g}", (6, height - low - share * most * per_y + 6), GREY, 0.6)
+        number = round(share * last)
+        draw_text(chart.picture, f"{number}", (left + per_x * number - 6, height - low + 24), GREY, 0.6)
+    if now >= 0:
+        draw_line(chart, np.array([[now, 0, 0], [now, most, 0]]), WHITE)
+    for row, (name, (values, colour)) in enumerate(series.items()):
+        draw_line(chart, np.column_stack([np.arange(len(values)), values, 0 * values]), colour, 2)
+        wide = cv2.getTextSize(name, cv2.FONT_HERSHEY_SIMPLEX, 0.65, 1)[0][0]
+        draw_text(chart.picture, name, (width - 12 - wide, top + 22 * row + 16), colour, 0.65)
+    draw_text(chart.picture, title, (8, 24), size=0.7, widest_px=width - 16)
+    draw_text(chart.picture, "iteration", (width / 2, height - 8), GREY, 0.6)
+    return chart.picture
+
+
+def titled(picture: Picture, *lines: str, size: float = 0.7, legend: Mapping[str, Colour] | None = None) -> Picture:
+    """The picture below lines of text, and one with a legend."""
+    if legend:
+        strip = np.full((_LINE_PX + 4, picture.shape[1], 3), GROUND, np.uint8)
+        draw_legend(strip, legend, (0, 0), across=True)
+        picture = np.concatenate([strip, picture])
+    bar = np.full((_LINE_PX * len(lines) + 4, picture.shape[1], 3), GROUND, np.uint8)
+    for row, text in enumerate(lines):
+        draw_text(bar, text, (4, _LINE_PX * (row + 1) - 5), size=size, widest_px=bar.shape[1] - 8)
+    return np.concatenate([bar, picture])
+
+
+def beside(pictures: Sequence[Picture], *, below: bool = False) -> Picture:
+    """Pictures from left to right, or one below the other, with gaps."""
+    height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
+    parts = []
+    for picture in pictures:
+        h, w = picture.shape[:2]
+        bottom, right = (_GAP_PX, width - w) if below else (height - h, _GAP_PX)
+        parts.append(cv2.copyMakeBorder(picture, 0, bottom, 0, right, cv2.BORDER_CONSTANT, value=GROUND))
+    return np.asarray(np.concatenate(parts, axis=0 if below else 1), dtype=np.uint8)
+
+
+def write_gif(path: Path | str, frames: Sequence[Picture], seconds: float, seconds_at_end: float) -> None:
+    """Write pictures of one size as a GIF that repeats for ever, the last one shown for longer."""
+    if not cv2.haveImageWriter("a.gif"):
+        cure = "pip install --upgrade opencv-python-headless"
+        raise InputError("OpenCV", "a version that writes GIF files", cv2.__version__, cure)
+    animation = cv2.Animation()
+    animation.frames = [np.ascontiguousarray(frame[..., ::-1]) for frame in frames]
+    animation.durations = np.array([1000 * seconds] * (len(frames) - 1) + [1000 * seconds_at_end], np.int32)
+    # A palette of 256 colours for each picture; dithered colours would flicker.
+    params = [cv2.IMWRITE_GIF_QUALITY, cv2.IMWRITE_GIF_COLORTABLE_SIZE_256, cv2.IMWRITE_GIF_DITHER, 3]
+    encoded, content = cv2.imencodeanimation(".gif", animation, params)
+    if not encoded:
+        raise OSError(f"{path}: cannot encode {len(frames)} pictures as GIF")
+    write_bytes(path, content.tobytes())
 
 
 def _fixed_point(pixels: Array) -> npt.NDArray[np.int32]:

@@ -18,7 +18,7 @@ from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.status import Status
-from directshape_torch.visualize.drawing import BLUE, GREY, Array, Colour, Surface
+from directshape_torch.visualize.drawing import BLUE, GREY, ORANGE, Array, Colour, Surface
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class DrawnCar:
     code: Array  # (K,) of the shape
     mesh: Surface | None  # the shape in its object frame, or None where no prior is at hand
     line: int  # of the detection file
-    status: str = ""  # how its refinement ended; of a state before it nothing
+    status: str | None = None  # how its refinement ended; None before it
 
     @property
     def surface(self) -> Surface | None:
@@ -44,8 +44,13 @@ class DrawnCar:
 
     @property
     def colour(self) -> Colour:
-        """Of the state after a refinement."""
-        return BLUE if is_refined(self.status) else GREY
+        """Before a refinement, after it, or of a car that was not refined."""
+        return ORANGE if self.status is None else BLUE if self.is_refined else GREY
+
+    @property
+    def is_refined(self) -> bool:
+        """Whether it is in a refined state."""
+        return self.status is not None and is_refined(self.status)
 
 
 def is_refined(status: str) -> bool:
@@ -55,13 +60,20 @@ def is_refined(status: str) -> bool:
 
 def drawn_cars(loaded: LoadedFrame, result: RefinementResult) -> tuple[list[DrawnCar], list[DrawnCar]]:
     """The cars of a refined frame before and after."""
-    t_cam_ref, boxes = loaded.frame.camera.t_cam_ref[0], result.boxes()
-    before = cars_before(loaded.detected_objects, t_cam_ref, mean_car(result.prior), result.code.shape[1])
-    corners = corners_cam(boxes.location_ref, boxes.rotation_y, boxes.dimensions_hwl, t_cam_ref)
+    objects, t_cam_ref = loaded.detected_objects, loaded.frame.camera.t_cam_ref[0]
+    before = cars_before(objects, t_cam_ref, mean_car(result.prior), result.code.shape[1])
+    return before, cars_of_result(result, [one.line_number for one in objects], before)
+
+
+def cars_of_result(
+    result: RefinementResult, lines: Sequence[int], before: Sequence[DrawnCar] | None = None
+) -> list[DrawnCar]:
+    """The cars of a result, with the numbers of their lines; those that were not refined as they were `before`."""
+    boxes = result.boxes()
+    corners = corners_cam(boxes.location_ref, boxes.rotation_y, boxes.dimensions_hwl, result.t_cam_ref)
     T_cam_obj, codes = (x.detach().cpu().numpy() for x in (result.T_cam_obj, result.code))
     statuses = [status.name for status in result.status]
-    lines = [one.line_number for one in loaded.detected_objects]
-    return before, cars_after(lines, statuses, T_cam_obj, codes, corners, before, result.prior)
+    return cars_after(lines, statuses, T_cam_obj, codes, corners, before, result.prior)
 
 
 def corners_cam(location_ref: Tensor, rotation_y: Tensor, hwl: Tensor, t_cam_ref: Tensor) -> Array:

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.compile import compiling
@@ -23,9 +20,9 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.solver.gauss_newton import Minimum, minimise, search_start
 from directshape_torch.solver.problem import put_rows, where_rows
+from directshape_torch.status import Status
 from directshape_torch.terms.cars import CarBatch, CarState
-from directshape_torch.terms.photometric import Photometric, Surface
-from directshape_torch.terms.term import Part
+from directshape_torch.visualize.residuals import CarResiduals, car_residuals
 
 
 @dataclass(frozen=True)
@@ -63,6 +60,19 @@ class RefinementTrace:
     def codes(self) -> Tensor:
         """Shape codes (N + 1, B, K)."""
         return torch.stack([state.code for state in self.states])
+
+    def moment(self, number: int) -> RefinementResult:
+        """The result if all cars had ended in state `number`, also of cars that got their input back."""
+        took_part = torch.zeros_like(self.result.status_code).index_fill(0, self.rows, 1).bool()
+        status = self.result.status_code.where(~took_part, Status.converged.code)
+        state = self.states[number]
+        return replace(self.result, T_cam_obj=se3.inverse(state.T_obj_cam), code=state.code, status_code=status)
+
+    @torch.no_grad()
+    def residuals(self, number: int) -> dict[int, CarResiduals]:
+        """What the images say of state `number` of each car that took part, by its row among the detections."""
+        state = CarState(*(x[self.rows] for x in self.states[number]))
+        return dict(zip(self.rows.tolist(), car_residuals(self.last_stage, self.pixels, state), strict=True))
 
     def place_of(self, car: int) -> int:
         """Number of a car among those that took part; -1 if it did not."""
@@ -129,61 +139,3 @@ def without_photometry(refiner: DirectShapeRefiner) -> DirectShapeRefiner:
     """The same refiner with silhouettes and priors alone, whose poses drift (paper, fig. of the projection's drift)."""
     config = refiner.config
     return DirectShapeRefiner(refiner.prior, replace(config, photometric=replace(config.photometric, weight=0.0)))
-
-
-class PixelResiduals(NamedTuple):
-    """P pixels of one car with what the cost says of them."""
-
-    uv: NDArray[np.float64]  # (P, 2) full-resolution pixels
-    value: NDArray[np.float64]  # (P,)
-    lost: NDArray[np.bool_]  # (P,) there is nothing to compare, and the pixel pays a constant
-
-
-class CarResiduals(NamedTuple):
-    """What the images say of one car; no pixels where there is no such term."""
-
-    silhouette_left: PixelResiduals  # `-log` of the probability of the mask; a ray that passes by is not lost
-    silhouette_right: PixelResiduals
-    photometric: PixelResiduals  # right less left, grey levels, mean over the part of the neighbourhood on the car
-
-
-# Of all cars: the place of the car of each pixel, and its uv, value and whether it is lost.
-_Pixels = tuple[Tensor, Tensor, Tensor, Tensor]
-
-
-@torch.no_grad()
-def car_residuals(trace: RefinementTrace, number: int) -> dict[int, CarResiduals]:
-    """Residuals for state `number` of the trace of each car that took part, by its row among the detections."""
-    stage, state = trace.last_stage, CarState(*(x[trace.rows] for x in trace.states[number]))
-    figures, masks = stage.figures(stage.problem.look(state)), stage.problem.masks
-    nothing = torch.zeros(0)
-    parts: dict[str, _Pixels] = dict.fromkeys(
-        CarResiduals._fields, (nothing, nothing.view(0, 2), nothing, nothing.bool())
-    )
-    for term, at in zip(stage.terms, figures.parts, strict=True):
-        if term.names == CarResiduals._fields[:2]:
-            for side, pixels in enumerate((trace.pixels.left, trace.pixels.right)):
-                value = at.residual[..., 0][(masks.filled > 0) & (masks.side == side)[:, None]]
-                parts[term.names[side]] = pixels.object_index, pixels.uv, value, torch.zeros_like(value).bool()
-        elif isinstance(term, Photometric):
-            parts["photometric"] = _of_photometry(term, at)
-    return {
-        row: CarResiduals(*(_of_car(parts[name], place) for name in CarResiduals._fields))
-        for place, row in enumerate(trace.rows.tolist())
-    }
-
-
-def _of_car(pixels: _Pixels, place: int) -> PixelResiduals:
-    uv, value, lost = (x[pixels[0] == place].cpu().numpy() for x in pixels[1:])
-    return PixelResiduals(uv.astype(np.float64), value.astype(np.float64), lost)
-
-
-def _of_photometry(term: Photometric, at: Part) -> _Pixels:
-    fixed, left = term.pixel_set, term.left
-    assert left is not None, "a stage of all cars has all pixels"
-    counted = fixed.rows.pixel_weight > 0
-    weight = fixed.rows.neighbour_weight.movedim(0, -1)
-    mean = (at.residual * weight).sum(dim=-1) / weight.sum(dim=-1).clamp_min(1)
-    pixel = left.packed.row.flatten()[fixed.sight_place]
-    car = fixed.blocks.owner[:, None].expand_as(counted)
-    return car[counted], left.pixels.uv[pixel[counted]], mean[counted], ~Surface(*at.where).usable[counted]

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.visualize.drawing import BLACK, Picture, blue_white_red
+from directshape_torch.visualize.drawing import BLACK, Picture, beside, blue_white_red, titled
 
 if TYPE_CHECKING:
     from directshape_torch.rig.estimate import RigEstimate
 
-_TITLE_HEIGHT_PX = 34
 _CONTOUR_STEP_PX = 0.25
 _DOT_RADIUS_PX = 6
 
@@ -31,10 +30,9 @@ def draw_rigs(
     pictures = []
     for rig in rigs:
         offset = rig.rows[:, 3] - rig.detector.bias * rig.rows[:, 2]
-        pictures.append(_titled(str(rig), draw_disparity_field(rig.field, rig.rows[:, :2], offset)))
-    width = max(picture.shape[1] for picture in pictures)
-    padded = [np.pad(p, ((0, 0), (0, width - p.shape[1]), (0, 0)), constant_values=255) for p in pictures]
-    return np.concatenate(padded)
+        field = draw_disparity_field(rig.field, rig.rows[:, :2], offset)
+        pictures.append(titled(field, str(rig)))
+    return beside(pictures, below=True)
 
 
 def draw_disparity_field(
@@ -47,10 +45,10 @@ def draw_disparity_field(
     most = max(float(np.abs(values).max()), float(bias_px.abs().quantile(0.9)) if len(bias_px) else 0.0)
     limit = max(0.5, math.ceil(2 * most) / 2)
     colours = f"blue -{limit:g} px, white 0, red +{limit:g} px; the grey line is drawn round the data"
-    panels = [_titled(f"measured less true disparity: {colours}", _field_panel(field, values, limit))]
+    panels = [titled(_field_panel(field, values, limit), f"measured less true disparity: {colours}")]
     for name, data in (("before the field is taken off", bias_px), ("after", after)) if len(bias_px) else ():
-        panels.append(_titled(_summary(name, data), _data_panel(field, uv_left, data, limit)))
-    return np.concatenate(panels)
+        panels.append(titled(_data_panel(field, uv_left, data, limit), _summary(name, data)))
+    return beside(panels, below=True)
 
 
 def _field_values(field: DisparityField) -> NDArray[np.float64]:
@@ -100,13 +98,6 @@ def _with_hull(panel: Picture, field: DisparityField) -> Picture:
     corners = field.hull_uv.round().int().cpu().numpy()[:, None]
     cv2.polylines(panel, [corners], True, (150, 150, 150), 2, cv2.LINE_AA)
     return panel
-
-
-def _titled(title: str, panel: Picture) -> Picture:
-    """The panel with a line of text above it."""
-    bar = np.full((_TITLE_HEIGHT_PX, panel.shape[1], 3), 255, np.uint8)
-    cv2.putText(bar, title, (8, 23), cv2.FONT_HERSHEY_SIMPLEX, 0.6, BLACK, 1, cv2.LINE_AA)
-    return np.concatenate([bar, panel])
 
 
 def _summary(name: str, values_px: Tensor) -> str:

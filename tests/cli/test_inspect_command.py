@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import cv2
@@ -31,17 +30,6 @@ def test_demo_car(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert picture.std() > 10
     with Image.open(folder / "iterations.gif") as animation:
         assert animation.n_frames > 3
-
-
-def test_without_matplotlib_nothing_is_refined_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    assert main(["inspect", "--demo", *_FAST, "--out", str(tmp_path / "figures")]) == 2
-    shown = capsys.readouterr()
-    assert shown.out == ""
-    assert shown.err.splitlines()[0].endswith("pip install 'directshape_torch[plot]'")
-    assert not (tmp_path / "figures").exists()
 
 
 @pytest.mark.parametrize("setting", ["method=geometric", "photometric.weight=0", "silhouette.weight=0"])

@@ -25,7 +25,7 @@ def test_each_car_of_several_frames_moves(shared_kitti: Path, tmp_path: Path) ->
     # By association, in which the pedestrian's line is counted too.
     assert [path.name for path in found] == ["track_000000.gif", "track_000002.gif"]
     with Image.open(found[0]) as animation:
-        assert (animation.n_frames, animation.size) == (2, (480, 360))
+        assert (animation.n_frames, animation.size) == (2, (480, 364))
 
 
 def test_a_car_of_one_frame_alone_has_nothing_to_move(

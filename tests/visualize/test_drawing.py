@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -10,21 +13,23 @@ from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.visualize.drawing import (
     Surface,
     View,
+    curves,
     draw_box,
     draw_contour,
     draw_segment,
     silhouette_mask,
+    write_gif,
 )
 from directshape_torch.visualize.rig_picture import draw_disparity_field
 
-K = np.array([[100.0, 0.0, 50.0], [0.0, 100.0, 40.0], [0.0, 0.0, 1.0]])
+P = np.array([[100.0, 0.0, 50.0, 0.0], [0.0, 100.0, 40.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
 SQUARE = np.array([[-1.0, -1.0, 10.0], [1.0, -1.0, 10.0], [1.0, 1.0, 10.0], [-1.0, 1.0, 10.0]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
 BLUE = (0, 0, 255)
 
 
 def black(width: int = 101, height: int = 81) -> View:
-    return View(np.zeros((height, width, 3), np.uint8), K)
+    return View(np.zeros((height, width, 3), np.uint8), P)
 
 
 def test_silhouette_of_a_square() -> None:
@@ -59,13 +64,14 @@ def test_contour_has_no_line_along_the_border_of_the_picture() -> None:
 def test_enlarged_window_projects_to_the_same_things() -> None:
     image = np.zeros((81, 101, 3), np.uint8)
     image[35, 55] = 255
-    view = View(image, K).part((50, 30, 60, 40), 4.0)
+    view = View(image, P).part((50, 30, 60, 40), (40, 40))
     assert view.picture.shape == (40, 40, 3)
     # The point that is seen at pixel (55, 35): offset (5, -5) px at 10 m.
     point = np.array([[0.5, -0.5, 10.0]])
     u, v = view.project(point)[0]
     # Pixel 55 is the sixth of the window: its centre lies at 4 * 5.5 - 0.5.
     assert (u, v) == pytest.approx((21.5, 21.5))
+    assert view.places(np.array([[55.0, 35.0]]))[0] == pytest.approx((u, v))
     bright_rows, bright_columns = np.nonzero(view.picture[..., 0] > 100)
     assert bright_columns.mean() == pytest.approx(u, abs=0.1)
     assert bright_rows.mean() == pytest.approx(v, abs=0.1)
@@ -93,18 +99,57 @@ def test_box_is_drawn_around_its_corners() -> None:
     assert abs(rows.max() - 51.1) <= 2
 
 
+@pytest.mark.parametrize("points", [[[0.0, 0.0, -5.0]], [[-90.0, 0.0, 10.0], [-80.0, 1.0, 10.0]]])
+def test_nothing_is_around_what_is_not_seen(points: list[list[float]]) -> None:
+    assert black().around(np.array(points), (90, 60)) is None
+
+
+@pytest.mark.parametrize("x", [-4.5, 0.0, 4.0])
+def test_the_part_around_a_car_has_its_size_and_stays_in_the_picture(x: float) -> None:
+    image = np.full((81, 101, 3), 9, np.uint8)
+    view = View(image, P).around(SQUARE + np.array([x, 0, 0]), (90, 60))
+    assert view is not None
+    assert view.picture.shape == (60, 90, 3)
+    assert (view.picture > 0).all()
+    # 20 px of 81, with room: seen whole where the image shows it whole.
+    u, v = view.project(SQUARE + np.array([x, 0, 0])).T
+    assert v.min() > 0
+    assert v.max() < 59
+    assert u.max() < 90 or x > 3.9
+
+
+def test_gif_read_back(tmp_path: Path) -> None:
+    red, blue = (np.full((12, 20, 3), colour, np.uint8) for colour in ((255, 0, 0), (0, 0, 255)))
+    write_gif(tmp_path / "a.gif", [red, blue, red], 0.1, 1.5)
+    written = (tmp_path / "a.gif").read_bytes()
+    write_gif(tmp_path / "a.gif", [red, blue, red], 0.1, 1.5)
+    assert (tmp_path / "a.gif").read_bytes() == written
+    found, animation = cv2.imdecodeanimation(np.frombuffer(written, np.uint8))
+    assert found
+    assert (len(animation.frames), animation.loop_count) == (3, 0)
+    assert np.ravel(animation.durations).tolist() == [100, 100, 1500]
+    for picture, frame in zip((red, blue, red), animation.frames, strict=True):
+        np.testing.assert_allclose(frame[..., 2::-1].astype(int), picture.astype(int), atol=8)
+
+
+def test_curves_fall_where_their_values_fall() -> None:
+    picture = curves({"cost": (np.array([4.0, 1.0, 0.0]), BLUE)}, "cost", (400, 300))
+    rows, columns = np.nonzero((picture == BLUE).all(axis=2))
+    left = rows[columns < 100].mean()
+    assert left < rows[columns > 340].mean() - 100
+
+
 FIELD_SIZE = (200, 80)
-TITLE_PX = 34
+TITLE_PX, GAP_PX = 30, 6
 
 
 @pytest.mark.parametrize(("value_px", "strong", "weak"), [(-0.4, 2, 0), (0.4, 0, 2)])
 def test_negative_is_blue_and_positive_red(value_px: float, strong: int, weak: int) -> None:
     field = DisparityField.constant(value_px, FIELD_SIZE, torch.eye(3), torch.eye(3), torch.eye(4))
     picture = draw_disparity_field(field, torch.tensor([[100.0, 40.0]]), torch.tensor([value_px]))
-    assert picture.shape == (3 * (FIELD_SIZE[1] + TITLE_PX), FIELD_SIZE[0], 3)
-    field_pixel = picture[TITLE_PX + 40, 100].astype(int)
-    before = picture[(TITLE_PX + FIELD_SIZE[1]) + TITLE_PX + 40, 100].astype(int)
-    after = picture[2 * (TITLE_PX + FIELD_SIZE[1]) + TITLE_PX + 40, 100].astype(int)
+    panel_px = TITLE_PX + FIELD_SIZE[1] + GAP_PX
+    assert picture.shape == (3 * panel_px, FIELD_SIZE[0], 3)
+    field_pixel, before, after = (picture[n * panel_px + TITLE_PX + 40, 100].astype(int) for n in range(3))
     assert field_pixel[strong] > field_pixel[weak] + 80
     assert before[strong] > before[weak] + 80
     assert after.min() > 240

@@ -11,7 +11,7 @@ from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Array
 from directshape_torch.visualize.drawn_car import DrawnCar
 from directshape_torch.visualize.overlay import Footprint, birds_eye_picture, overlay_picture
 
-K = np.array([[700.0, 0.0, 500.0], [0.0, 700.0, 150.0], [0.0, 0.0, 1.0]])
+P = np.array([[700.0, 0.0, 500.0, 0.0], [0.0, 700.0, 150.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
 # Two triangles a face would do as well for pictures: the outline is that of the convex hull.
 FACES = np.array([[i, j, k] for i in range(8) for j in range(i + 1, 8) for k in range(j + 1, 8)])
 
@@ -22,7 +22,7 @@ def corners(x: float, z: float) -> Array:
     return found
 
 
-def car(x: float, z: float, line: int = 1, status: str = "converged") -> DrawnCar:
+def car(x: float, z: float, line: int = 1, status: str | None = "converged") -> DrawnCar:
     points = corners(x, z)
     return DrawnCar(np.eye(4), points, np.zeros(0), Surface(points, FACES), line, status)
 
@@ -32,11 +32,11 @@ def has_colour(picture: Picture, colour: tuple[int, int, int]) -> bool:
 
 
 def image(height: int = 300, width: int = 1000) -> View:
-    return View(np.full((height, width, 3), 90, np.uint8), K)
+    return View(np.full((height, width, 3), 90, np.uint8), P)
 
 
 def test_rows_show_before_and_after() -> None:
-    picture = overlay_picture(image(), [car(0, 12)], [car(0.5, 13)], [corners(0.4, 13)])
+    picture = overlay_picture(image(), [car(0, 12, status=None)], [car(0.5, 13)], [corners(0.4, 13)])
     before, after, birds_eye = picture[30:300, :1000], picture[330:600, :1000], picture[:, 1000:]
     assert has_colour(before, ORANGE)
     assert not has_colour(before, BLUE)
@@ -48,14 +48,14 @@ def test_rows_show_before_and_after() -> None:
 
 
 def test_cars_that_were_not_refined_are_grey() -> None:
-    picture = overlay_picture(image(), [car(0, 12)], [car(0, 12, status="no_mask")])
+    picture = overlay_picture(image(), [car(0, 12, status=None)], [car(0, 12, status="no_mask")])
     assert has_colour(picture[330:600, :1000], GREY)
     assert not has_colour(picture[330:600, :1000], BLUE)
 
 
 @pytest.mark.parametrize("z", [-8.0, 0.5, 400.0])
 def test_cars_in_odd_places_do_not_break_the_picture(z: float) -> None:
-    picture = overlay_picture(image(), [car(0, z), car(0, 12, 2)], [car(0, z), car(0, 12, 2)])
+    picture = overlay_picture(image(), [car(0, z, status=None), car(0, 12, 2, None)], [car(0, z), car(0, 12, 2)])
     assert has_colour(picture[30:300, :1000], ORANGE)
 
 

@@ -13,7 +13,7 @@ from directshape_torch.io.config_files import load_config
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections
-from directshape_torch.visualize.refinement_trace import RefinementTrace, car_residuals, trace_refinement
+from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
 
 _SEARCH = "search.disparity_offsets_px=[-2,2]"
 
@@ -53,7 +53,7 @@ def test_costs_at_the_ends_are_those_of_the_result(trace: RefinementTrace) -> No
 
 
 def test_a_refinement_without_images_has_no_residuals_of_them(trace: RefinementTrace) -> None:
-    counts = [len(pixels.uv) for pixels in car_residuals(trace, 0)[1]]
+    counts = [len(pixels.uv) for pixels in trace.residuals(0)[1]]
     assert counts == [0, 0, 0] if trace.config.method == "geometric" else min(counts) > 0
 
 

@@ -51,7 +51,7 @@ function toggleMaps(button, car, maps) {
 }
 
 const KINDS = [
-  ["photometric", "Photometric residual", "right image darker than the left one, warped by the shape", "brighter (white: they agree; full colour from 40 grey levels)"],
+  ["photometric", "Photometric residual", "right image darker than the left one, warped by the shape", "brighter (white: they agree; full colour from 30 grey levels)"],
   ["silhouette", "Silhouette residual", "mask that the shape does not fill", "shape that spills out of its mask"],
 ];
 

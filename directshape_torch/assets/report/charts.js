@@ -17,7 +17,7 @@ export function showDistributions() {
   const judged = cars.filter((car) => car.counts);
   if (hasLabels && judged.length) {
     charts.append(
-      histogram("Bird's-eye IoU with the label (more is better)", judged, "iou_before", "iou_after", 0, 1, ""),
+      histogram("Bird's-eye IoU", judged, "iou_before", "iou_after", 0, 1, ""),
       changes(judged.map(iouChange).filter((value) => value !== null)),
       histogram("Centre error", judged, "centre_before_m", "centre_after_m", 0, null, "m"),
     );

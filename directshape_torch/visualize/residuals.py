@@ -1,0 +1,166 @@
+"""What images and masks say of cars, pixel by pixel: the residuals of the energy, as values, colours and pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from directshape_torch.config import RefinerConfig
+from directshape_torch.geometry import se3
+from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.numerics.full_precision import full_precision
+from directshape_torch.observation.packing import Observation, pack_pixels
+from directshape_torch.observation.refinable import without_empty_masks
+from directshape_torch.refinement.problem import CarStage
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.terms.cars import CarState
+from directshape_torch.terms.photometric import Photometric, Surface
+from directshape_torch.terms.term import Part
+from directshape_torch.visualize.drawing import Array, View, blue_white_red
+
+WORST_SILHOUETTE = 4.6
+"""-log 0.01: what a pixel pays whose mask is certain and wrong."""
+WORST_GREY_LEVELS = 30.0
+"""Differences of the images from here on have the full colour."""
+
+_MOST_PIXELS = 8000
+# A pixel whose mask is sure and right pays about as much.
+_NOTHING_SILHOUETTE = 0.2
+_LOST: tuple[int, int, int] = (110, 110, 110)
+# Where a shape spills out of its mask, and where it does not fill it.
+_SPILLED, _UNFILLED = (np.array(c, dtype=np.float64) for c in ((255, 140, 0), (186, 60, 220)))
+_DARK = np.array([40.0, 40.0, 40.0])
+
+
+class PixelResiduals(NamedTuple):
+    """P pixels of one car with what the cost says of them."""
+
+    uv: NDArray[np.float64]  # (P, 2) full-resolution pixels
+    value: NDArray[np.float64]  # (P,)
+    lost: NDArray[np.bool_]  # (P,) there is nothing to compare, and the pixel pays a constant
+
+
+class CarResiduals(NamedTuple):
+    """What the images say of one car; no pixels where there is no such term.
+
+    Silhouettes: `-log` of the probability of the mask, above 0 where the shape spills out of it, below where it does
+    not fill it; a ray that passes by is not lost. Photometric: right less left, grey levels, mean over the part of the
+    neighbourhood on the car.
+    """
+
+    silhouette_left: PixelResiduals
+    silhouette_right: PixelResiduals
+    photometric: PixelResiduals
+
+
+# Of all cars: the place of the car of each pixel, and its uv, value and whether it is lost.
+_Pixels = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+@torch.no_grad()
+def car_residuals(stage: CarStage, pixels: Observation, state: CarState) -> list[CarResiduals]:
+    """Residuals of R cars in a state, at a stage that has begun with these pixels."""
+    figures, masks = stage.figures(stage.problem.look(state)), stage.problem.masks
+    nothing = torch.zeros(0)
+    parts: dict[str, _Pixels] = dict.fromkeys(
+        CarResiduals._fields, (nothing, nothing.view(0, 2), nothing, nothing.bool())
+    )
+    for term, at in zip(stage.terms, figures.parts, strict=True):
+        if term.names == CarResiduals._fields[:2]:
+            for side, of_side in enumerate((pixels.left, pixels.right)):
+                value = at.residual[..., 0][(masks.filled > 0) & (masks.side == side)[:, None]]
+                signed = torch.where(of_side.foreground > 0.5, -value, value)
+                parts[term.names[side]] = of_side.object_index, of_side.uv, signed, torch.zeros_like(value).bool()
+        elif isinstance(term, Photometric):
+            parts["photometric"] = _of_photometry(term, at)
+    return [
+        CarResiduals(*(_of_car(parts[name], car) for name in CarResiduals._fields)) for car in range(len(state.code))
+    ]
+
+
+def _of_car(pixels: _Pixels, car: int) -> PixelResiduals:
+    uv, value, lost = (x[pixels[0] == car].cpu().numpy() for x in pixels[1:])
+    return PixelResiduals(uv.astype(np.float64), value.astype(np.float64), lost)
+
+
+def _of_photometry(term: Photometric, at: Part) -> _Pixels:
+    fixed, left = term.pixel_set, term.left
+    assert left is not None, "a stage of all cars has all pixels"
+    counted = fixed.rows.pixel_weight > 0
+    weight = fixed.rows.neighbour_weight.movedim(0, -1)
+    mean = (at.residual * weight).sum(dim=-1) / weight.sum(dim=-1).clamp_min(1)
+    pixel = left.packed.row.flatten()[fixed.sight_place]
+    car = fixed.blocks.owner[:, None].expand_as(counted)
+    return car[counted], left.pixels.uv[pixel[counted]], mean[counted], ~Surface(*at.where).usable[counted]
+
+
+class ResidualMaps:
+    """Residuals of the cars of a frame in any state, at pixels that are evenly spaced over their regions.
+
+    Args:
+        loaded: the frame, with the detections whose masks the cars have.
+        prior: the shapes of the states.
+        config: of the refinement.
+        rows: the detections (R,) that have a pose.
+    """
+
+    def __init__(self, loaded: LoadedFrame, prior: ShapePrior, config: RefinerConfig, rows: Tensor) -> None:
+        sampling = replace(config.sampling, mode="uniform", mode_right="uniform", density=1.0, max_pixels=_MOST_PIXELS)
+        config = replace(config, method="direct", compile="off", sampling=sampling)
+        frame, detections = loaded.frame, loaded.detections
+        chosen = torch.zeros(len(detections), dtype=torch.bool).index_fill(0, rows, True)
+        with torch.no_grad(), full_precision(frame.images_left.device.type):
+            problem, self._input = DirectShapeRefiner(prior, config).problem(frame, detections)
+            self._problem, self._stage = problem.of_problems(chosen), config.stages[-1]
+            self._pixels = pack_pixels(frame, without_empty_masks(detections), sampling).of_objects(chosen)
+        self._rows = rows
+
+    @torch.no_grad()
+    def of(self, T_cam_obj: Array, codes: Array) -> list[CarResiduals]:
+        """Of states (R, 4, 4) and (R, K); photometric pixels are those of the car as it is there."""
+        start = CarState(*(x[self._rows] for x in self._input))
+        poses, shapes = (torch.from_numpy(np.asarray(x)).to(start.code) for x in (T_cam_obj, codes))
+        state = start._replace(T_obj_cam=se3.inverse(poses), code=shapes)
+        stage = self._problem.begin(self._stage, self._problem.look(state))
+        return car_residuals(stage, self._pixels, state)
+
+
+def silhouette_colours(values: PixelResiduals) -> NDArray[np.uint8]:
+    """(P, 3) orange where the shape spills out of its mask, violet where it does not fill it, dark where they agree."""
+    strength = np.clip(np.abs(values.value) / WORST_SILHOUETTE, 0, 1)[:, None] ** 0.7
+    return _uint8(_DARK + strength * (np.where(values.value[:, None] > 0, _SPILLED, _UNFILLED) - _DARK))
+
+
+def photometric_colours(values: PixelResiduals) -> NDArray[np.uint8]:
+    """(P, 3) blue where the right image is darker, white where they agree, red where it is brighter; grey: lost."""
+    colours = _uint8(blue_white_red(values.value, WORST_GREY_LEVELS))
+    colours[values.lost] = _LOST
+    return colours
+
+
+def draw_residuals(view: View, residuals: CarResiduals, name: str, share: float = 1.0) -> None:
+    """One kind of residuals as squares on its image, which becomes dark; silhouettes only where they differ.
+
+    A square is as large as a share of the distance of the pixels.
+    """
+    view.picture[...] = view.picture.mean(axis=2, keepdims=True) * 0.5
+    values, uv = getattr(residuals, name), residuals.silhouette_left.uv
+    if name != "photometric":
+        values = PixelResiduals(*(x[np.abs(values.value) > _NOTHING_SILHOUETTE] for x in values))
+    colours = (photometric_colours if name == "photometric" else silhouette_colours)(values)
+    apart_px = float(np.sqrt(np.prod(np.ptp(uv, axis=0) + 1) / len(uv))) if len(uv) else 1.0
+    half = 0.5 * max(share * apart_px * view.from_image[0, 0], 2.0)
+    for place, colour in zip(view.places(values.uv), colours.tolist(), strict=True):
+        first, last = np.floor(place - half + 0.5), np.ceil(place + half - 0.5)
+        cv2.rectangle(view.picture, first.astype(int).tolist(), last.astype(int).tolist(), colour, -1)
+
+
+def _uint8(colours: Array) -> NDArray[np.uint8]:
+    return np.asarray(np.round(np.clip(colours, 0, 255)).astype(np.uint8))
