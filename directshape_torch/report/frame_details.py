@@ -99,8 +99,10 @@ def _part(view: View | None, states: dict[str, DrawnCar]) -> View | None:
 
 def _thumbnails(part: View | None, states: dict[str, DrawnCar]) -> dict[str, str]:
     """Nothing for a car that the image does not show."""
-    pictures = {}
-    for name, state in states.items() if part is not None else ():
+    pictures: dict[str, str] = {}
+    if part is None:
+        return pictures
+    for name, state in states.items():
         view = part.copy()
         if state.surface is None:
             draw_box(view, state.corners_cam, state.colour)

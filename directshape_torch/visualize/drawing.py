@@ -277,7 +277,7 @@ def write_gif(path: Path | str, frames: Sequence[Picture], seconds: float, secon
         raise InputError("OpenCV", "a version that writes GIF files", cv2.__version__, cure)
     animation = cv2.Animation()
     animation.frames = [np.ascontiguousarray(frame[..., ::-1]) for frame in frames]
-    animation.durations = np.array([1000 * seconds] * (len(frames) - 1) + [1000 * seconds_at_end], np.int32)
+    animation.durations = [round(1000 * s) for s in (*[seconds] * (len(frames) - 1), seconds_at_end)]
     # A palette of 256 colours for each picture; dithered colours would flicker.
     params = [cv2.IMWRITE_GIF_QUALITY, cv2.IMWRITE_GIF_COLORTABLE_SIZE_256, cv2.IMWRITE_GIF_DITHER, 3]
     encoded, content = cv2.imencodeanimation(".gif", animation, params)
