@@ -212,24 +212,12 @@ class PointCloudConfig(Settings):
     """Point cloud from dense stereo, for the methods "geometric" (Engelmann et al., GCPR 2016) and "combined"."""
 
     weight: float = setting(
-        300.0, 'factor of the mean Huber norm of the signed distances, per square metre, for "geometric"', at_least=0
-    )
-    combined_weight: float = setting(
-        30.0, 'factor of the same for "combined": beside the images less is better', at_least=0
+        300.0,
+        'factor of the mean Huber norm of the signed distances, per square metre, for "geometric"; "combined" takes a '
+        "tenth of it: beside the images less is better",
+        at_least=0,
     )
     huber_m: float = setting(0.1, "corner of the Huber norm", above=0)
-    pixels: Literal["mask", "box"] = setting(
-        "mask", 'points of the left instance "mask" where there is one, else of the 2D box; or always of the "box"'
-    )
-    min_height_m: float = setting(
-        0.1, "points count from this height above the ground plane", at_least=-100, at_most=100
-    )
-    max_height_m: float = setting(
-        3.0, "points count up to this height above the ground plane", at_least="min_height_m", at_most=100
-    )
-    max_distance_m: float = setting(
-        2.5, "points count within this distance of the detection's centre, along the ground", above=0
-    )
     min_points: int = setting(
         200,
         'with fewer of them "geometric" leaves the car alone (status too_few_points) and "combined" has images only',

@@ -11,12 +11,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import NoneType
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
+from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.numerics.checks import (
     check_finite,
@@ -28,9 +29,6 @@ from directshape_torch.numerics.checks import (
     is_no_rotation,
 )
 from directshape_torch.numerics.records import Dense, TensorRecord
-
-if TYPE_CHECKING:
-    from directshape_torch.geometry.box_formats import BoxFormat
 
 # Of B cars in an image: (B, H, W), or (H, W) and None for each.
 Masks = Tensor | Sequence[Tensor | None]
@@ -322,8 +320,6 @@ class Detections(TensorRecord):
             >>> detections.T_cam_obj[0, :3, 3], detections.box_2d
             (tensor([ 1.0000,  1.6000, 20.0000]), tensor([[100.,  50., 179.,  79.]]))
         """
-        from directshape_torch.geometry.box_formats import boxes_to_poses
-
         T_cam_obj, dimensions_hwl = boxes_to_poses(boxes, convention, T_cam_boxes)
         count, given = len(boxes), {"mask_left": mask_left, "mask_right": mask_right}
         stacked = {name: _stacked(name, masks, count) for name, masks in given.items() if masks is not None}

@@ -21,7 +21,7 @@ from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
 from directshape_torch.shape.pca_fit import fit_pca
 from directshape_torch.shape.pca_prior import PriorProvenance
-from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
+from directshape_torch.shape.zero_level import sdf_to_mesh
 
 ROOT = Path(directshape_torch.__file__).parent / "assets" / "demo"
 

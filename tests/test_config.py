@@ -84,10 +84,6 @@ def test_a_value_of_the_wrong_kind_is_named(mapping: dict[str, Any], text: str) 
             "priors.dimensions_sigma_m: expected a finite number, above 0, got (0.1, 0.0, 0.1)",
         ),
         ("sampling.max_pixels=50", "sampling.max_pixels: expected a finite number, at least min_pixels = 400, got 50"),
-        (
-            "point_cloud.max_height_m=0",
-            "point_cloud.max_height_m: expected a finite number, at least min_height_m = 0.1 and at most 100, got 0.0",
-        ),
         ("point_cloud.huber_m=0", "point_cloud.huber_m: expected a finite number, above 0, got 0.0"),
         ("method=geometry", "method: expected one of direct, geometric, combined, box_alignment, got 'geometry'"),
         ("sampling.density=1.5", "sampling.density: expected a finite number, above 0 and at most 1, got 1.5"),

@@ -66,13 +66,15 @@ def test_a_prior_of_ones_own_counts_like_ours() -> None:
 def test_points_of_a_lidar_beside_the_images_are_the_combined_method() -> None:
     prior, scene = measured_street()
     detections = disturbed(scene.detections, 0.25, 0.08)
-    cloud = PointCloudConfig(weight=1000.0, combined_weight=1000.0, min_points=50)
+    cloud = PointCloudConfig(weight=1000.0, min_points=50)
 
     def lidar(frames: Any, detections: Any, *_: Any) -> PointCloud:
         return PointCloud.of_points(cloud, car_points(frames, detections, cloud), "lidar")
 
     extra = DirectShapeRefiner(prior, DEFAULT, [lidar])(scene.frames, detections)
-    combined = DirectShapeRefiner(prior, replace(DEFAULT, method="combined", point_cloud=cloud))
+    combined = DirectShapeRefiner(
+        prior, replace(DEFAULT, method="combined", point_cloud=replace(cloud, weight=10_000.0))
+    )
     torch.testing.assert_close(extra.T_cam_obj, combined(scene.frames, detections).T_cam_obj, rtol=0, atol=1e-9)
 
 

@@ -17,8 +17,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.box_formats import boxes_to_poses, poses_to_boxes
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.stereo_dataset import open_dataset
-from directshape_torch.shape.sdf_grid import zero_level_extents
-from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
+from directshape_torch.shape.zero_level import sdf_to_mesh, zero_level_extents
 
 PRIOR = PCAShapePrior.load_bundled().double()
 CODE = torch.tensor([[1.0, -0.8, 0.5, 0.0, 0.3, 0.0, 0.0, 0.0]], dtype=torch.float64)

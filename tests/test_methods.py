@@ -19,10 +19,10 @@ from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.status import Status
 
 WEAK = replace(DEFAULT.priors, shape_weight=0.01, dimensions_weight=0.0)
-CLOUD = PointCloudConfig(weight=1000.0, combined_weight=1000.0, min_points=50, rounds=12)
+CLOUD = PointCloudConfig(weight=1000.0, min_points=50, rounds=12)
 GEOMETRIC = replace(DEFAULT, method="geometric", point_cloud=CLOUD, priors=WEAK)
 JOINT = replace(GEOMETRIC, point_cloud=replace(CLOUD, order="joint", max_iterations=60))
-COMBINED = replace(DEFAULT, method="combined", point_cloud=CLOUD)
+COMBINED = replace(DEFAULT, method="combined", point_cloud=replace(CLOUD, weight=10_000.0))
 
 
 def scene_of(frames: FrameBatch | None = None) -> tuple[FrameBatch, Detections]:

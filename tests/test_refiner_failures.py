@@ -270,7 +270,7 @@ def test_weights_that_are_all_zero_are_named(method: Literal["direct", "geometri
         method=method,
         silhouette=replace(DEFAULT.silhouette, weight=0.0),
         photometric=replace(DEFAULT.photometric, weight=0.0),
-        point_cloud=replace(DEFAULT.point_cloud, weight=0.0, combined_weight=0.0),
+        point_cloud=replace(DEFAULT.point_cloud, weight=0.0),
         priors=priors,
     )
     with pytest.raises(ConfigError, match=rf"method {method}: expected a term of weight above 0, got none: silhouette"):

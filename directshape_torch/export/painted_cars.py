@@ -16,8 +16,8 @@ from directshape_torch.evaluation.shape_error import EstimatedCar
 from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observation.extents import MASK_THRESHOLD
-from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.shape.zero_level import sdf_to_mesh
 from directshape_torch.stereo_matching.disparity import with_disparity
 from directshape_torch.terms.car_points import car_points
 from directshape_torch.visualize.drawing import View

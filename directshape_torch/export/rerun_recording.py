@@ -21,7 +21,7 @@ from directshape_torch.io.kitti_labels import KittiObject, poses_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observation.extents import MASK_THRESHOLD
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
+from directshape_torch.shape.zero_level import sdf_to_mesh
 from directshape_torch.stereo_matching.disparity import rgb8
 from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Colour
 from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement

@@ -10,7 +10,6 @@ number of the instances that cover each pixel, tells of every car what hides it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -18,51 +17,11 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.observation.extents import MASK_THRESHOLD, SceneExtents, scene_extents
+from directshape_torch.rows import OcclusionMap
 from directshape_torch.scene import Detections
 
 Side = Literal["left", "right"]
 OcclusionOrder = Literal["depth", "box_bottom"]
-
-
-@dataclass(frozen=True)
-class OcclusionMap:
-    """What covers each pixel of one image side, foremost instances first.
-
-    There are two numbers, for instances of known and of unknown depth: the depth, metres, and less the lower edge of
-    the left 2D box, pixels.
-    """
-
-    # (B, 6) integer, of each object: u0, v0, u1, v1 of what all masks cover, half open; the entry of `covering` that
-    # pixel (0, 0) of its frame would have; entries from one row of pixels to the next
-    crop: Tensor
-    in_front: Tensor  # (B, 2) what an instance must be below to be in front of each object
-    covering: Tensor  # (A, 2) least numbers of the instances that cover each pixel, infinity where none does
-
-    def at(
-        self,
-        object_index: Tensor,  # (...)
-        uv: Tensor,  # (..., 2)
-    ) -> Tensor:
-        """Whether (...) an instance in front of the object covers the pixel next to each point; NaN is not hidden."""
-        if uv.is_floating_point():
-            # Far beyond any image, but within the integers.
-            uv = uv.round().nan_to_num(nan=-1.0, posinf=-1.0, neginf=-1.0).clamp(-1.0, 2.0**30)
-        u, v = uv.long().unbind(-1)
-        u0, v0, u1, v1, first, step = self.crop[object_index].unbind(-1)
-        inside = (u >= u0) & (u < u1) & (v >= v0) & (v < v1)
-        covering = self.covering[torch.where(inside, first + v * step + u, 0)]
-        return (covering < self.in_front[object_index]).any(dim=-1) & inside
-
-    def window(
-        self,
-        index: int,
-        region: tuple[int, int, int, int],  # u0, v0, u1, v1, half open
-    ) -> Tensor:
-        """Which pixels (v1 - v0, u1 - u0) of a region are hidden from one object, for pictures."""
-        u0, v0, u1, v1 = region
-        v, u = (torch.arange(*ends, device=self.crop.device) for ends in ((v0, v1), (u0, u1)))
-        uv = torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
-        return self.at(torch.full((), index, device=uv.device), uv)
 
 
 def occlusion_map(

@@ -16,8 +16,8 @@ from directshape_torch.config import SamplingConfig, SamplingMode
 from directshape_torch.geometry.camera import rays_from_pixels, right_rays
 from directshape_torch.image.grey_levels import gradient_magnitude_at, gradient_magnitude_of_part
 from directshape_torch.observation.extents import SceneExtents, region_boxes, scene_extents
-from directshape_torch.observation.occlusion import OcclusionMap, Side, occlusion_map
-from directshape_torch.rows import PixelSamples, PointSamples
+from directshape_torch.observation.occlusion import Side, occlusion_map
+from directshape_torch.rows import OcclusionMap, PixelSamples, PointSamples
 from directshape_torch.scene import Detections, FrameBatch
 
 

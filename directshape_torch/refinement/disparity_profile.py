@@ -24,8 +24,6 @@ from directshape_torch.terms.photometric_rows import PhotometricRows, residuals_
 
 # Two minima nearer than this are one with a dent.
 _APART_PX = 0.75
-# A rise on the way that is a smaller share of the lowest cost is noise and no ridge.
-_RIDGE_SHARE = 0.02
 # A second minimum less than this factor above the first could be the true one.
 AMBIGUOUS_BELOW = 1.25
 MAX_PIXELS = 100
@@ -42,14 +40,12 @@ class ProfileFigures(NamedTuple):
         sigma_px: (B,) standard deviation of that offset, from the curvature there and the cost that is left; infinite
             where the curve is flat, or falls to an end.
         distinctness: (B,) cost of the best other minimum, at least 0.75 px away, over the lowest; infinite without one.
-        in_basin: (B,) bool: from the state downhill one comes to the lowest cost.
         ambiguous: (B,) bool: the other minimum is nearly as low.
     """
 
     offset_px: Tensor
     sigma_px: Tensor
     distinctness: Tensor
-    in_basin: Tensor
     ambiguous: Tensor
 
 
@@ -120,8 +116,8 @@ def profile_figures(offsets_px: Tensor, cost: Tensor, num_pixels: Tensor) -> Pro
     Examples:
         >>> offsets = profile_offsets()
         >>> figures = profile_figures(offsets, 2 + (offsets - 0.4)[None] ** 2, torch.tensor([100.0]))
-        >>> figures.offset_px, figures.sigma_px, figures.in_basin
-        (tensor([0.4000], dtype=torch.float64), tensor([0.1414], dtype=torch.float64), tensor([True]))
+        >>> figures.offset_px, figures.sigma_px
+        (tensor([0.4000], dtype=torch.float64), tensor([0.1414], dtype=torch.float64))
     """
     known = cost.isfinite().all(dim=1)
     cost = torch.where(known[:, None], cost, 0.0)
@@ -133,8 +129,7 @@ def profile_figures(offsets_px: Tensor, cost: Tensor, num_pixels: Tensor) -> Pro
     distinctness = torch.where(other > lowest, other / lowest, torch.ones_like(lowest))
     nan = torch.full_like(lowest, torch.nan)
     offset, sigma, distinctness = (torch.where(known, x, nan) for x in (offset, sigma, distinctness))
-    in_basin = known & _is_downhill(offsets_px, cost, best, _RIDGE_SHARE * lowest)
-    return ProfileFigures(offset, sigma, distinctness, in_basin, known & (distinctness < AMBIGUOUS_BELOW))
+    return ProfileFigures(offset, sigma, distinctness, known & (distinctness < AMBIGUOUS_BELOW))
 
 
 def _vertex(offsets_px: Tensor, cost: Tensor, best: Tensor, num_pixels: Tensor) -> tuple[Tensor, Tensor]:
@@ -160,21 +155,6 @@ def _other_minimum(offsets_px: Tensor, cost: Tensor, best: Tensor) -> Tensor:
     is_minimum = (cost <= padded[:, :-2]) & (cost <= padded[:, 2:])
     is_apart = (offsets_px - offsets_px[best][:, None]).abs() > _APART_PX - 1e-6
     return torch.where(is_minimum & is_apart, cost, torch.inf).amin(dim=1)
-
-
-def _is_downhill(offsets_px: Tensor, cost: Tensor, best: Tensor, tolerance: Tensor) -> Tensor:
-    """Whether (B,) the cost falls all the way from offset 0 to the lowest one, but for rises within the tolerance."""
-    start = offsets_px.abs().argmin()
-    last = len(offsets_px) - 1
-    index = torch.arange(last + 1, device=cost.device)
-    # Rightwards from the start, by way of the mirrored curve where the lowest cost lies on the left.
-    rightwards = best >= start
-    ahead = torch.where(rightwards[:, None], cost, cost.flip(1))
-    begin, end = torch.where(rightwards, start, last - start), torch.where(rightwards, best, last - best)
-    is_on_way = (index >= begin[:, None]) & (index <= end[:, None])
-    lowest_so_far = torch.where(is_on_way, ahead, torch.inf).cummin(dim=1).values
-    rise = torch.where(is_on_way, ahead - lowest_so_far, -torch.inf).amax(dim=1)
-    return rise <= tolerance
 
 
 @torch.no_grad()

@@ -17,20 +17,19 @@ from torch import Tensor, nn
 from directshape_torch.errors import InputError, MissingDependencyError, shown
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, box_corners, rotation_y_from_pose
+from directshape_torch.geometry.box_formats import BoxFormat, poses_to_boxes
 from directshape_torch.numerics.checks import check_alike
 from directshape_torch.numerics.records import CarRecord, Dense
 from directshape_torch.refinement.disparity_profile import DisparityProfile
 from directshape_torch.refinement.observability import Observability
 from directshape_torch.refinement.quality import FitQuality, bundled_trust_model
 from directshape_torch.shape.pca_prior import PCAShapePrior
-from directshape_torch.shape.sdf_grid import zero_level_extents
 from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.shape.zero_level import sdf_to_mesh, zero_level_extents
 from directshape_torch.status import Status, is_refined
 
 if TYPE_CHECKING:
     import trimesh
-
-    from directshape_torch.geometry.box_formats import BoxFormat
 
 
 Frame = Literal["ref", "cam"]
@@ -250,8 +249,6 @@ class RefinementResult(CarRecord):
         Raises:
             InputError: an unknown convention or frame, or a LiDAR convention without `T_cam_boxes`.
         """
-        from directshape_torch.geometry.box_formats import poses_to_boxes
-
         T_frame_box, dimensions = self._boxes("cam" if T_cam_boxes is not None else frame)
         return poses_to_boxes(T_frame_box, dimensions, convention, T_cam_boxes)
 
@@ -300,8 +297,6 @@ class RefinementResult(CarRecord):
             raise InputError(
                 "index", f"a car of 0..{len(self) - 1}" if len(self) else "no car", f"{shown(index)}: {len(self)} cars"
             )
-        from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
-
         values = self.prior.values(self.code[index][None])[0]
         return sdf_to_mesh(values, self.prior.origin, self.prior.spacing_m, T_cam_obj=self.T_cam_obj[index])
 

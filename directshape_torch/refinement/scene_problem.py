@@ -20,16 +20,20 @@ from directshape_torch.rows import Rows
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.terms.check_term import check_term
 from directshape_torch.terms.motion import MOTION_NAMES
 from directshape_torch.terms.next_view import NEXT_VIEW_NAME
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.photometric_rows import LeftPixels
+from directshape_torch.terms.point_cloud import PointCloud
 from directshape_torch.terms.priors import prior_terms
 from directshape_torch.terms.silhouette import MaskRows, SilhouetteProducts, Silhouettes
 from directshape_torch.terms.term import Term
 
-# Those of "point_cloud" hold for the methods with points, the first two for the others.
-_WEIGHTS = "silhouette.weight, photometric.weight, point_cloud.weight or combined_weight, priors.*_weight"
+# That of "point_cloud" holds for the methods with points, the first two for the others.
+_WEIGHTS = "silhouette.weight, photometric.weight, point_cloud.weight, priors.*_weight"
+# Part of the weight of points that is best beside images.
+_BESIDE_IMAGES = 10
 
 TermFactory: TypeAlias = Callable[[FrameBatch, Detections, CarBatch, ShapePrior], Term]
 """Makes a user's term for some cars of a call: of these frames, all detections, the cars to refine, the shapes."""
@@ -59,10 +63,8 @@ def problem_of_scene(
     masks = MaskRows.of_pixels(pixels, sides, config.silhouette, len(cars))
     terms: list[Term] = []
     if observation.points is not None:
-        from directshape_torch.terms.point_cloud import PointCloud
-
-        cloud, weight = config.point_cloud, config.point_cloud.combined_weight
-        cloud = cloud if config.method == "geometric" else replace(cloud, weight=weight)
+        cloud = config.point_cloud
+        cloud = cloud if config.method == "geometric" else replace(cloud, weight=cloud.weight / _BESIDE_IMAGES)
         terms += [PointCloud.of_points(cloud, observation.points)] if cloud.weight > 0 else []
     if config.method in ("direct", "combined") and config.silhouette.weight > 0:
         form = SilhouetteProducts if config.silhouette.form == "product" else Silhouettes
@@ -86,8 +88,6 @@ def _check_extra(problem: CarProblem, own: int, cars: CarBatch) -> None:
     """Raise `InputError` unless the terms behind our `own` are what `Term` says, at the detector's poses."""
     if own == len(problem.terms):
         return
-    from directshape_torch.terms.check_term import check_term
-
     code = problem.prior.initial_code(len(cars)).to(cars.detector_T_cam_obj)
     sight = problem.look(CarState.of(se3.inverse(cars.detector_T_cam_obj), code, cars.num_offsets))
     names = [*MOTION_NAMES, NEXT_VIEW_NAME, *(name for term in problem.terms[:own] for name in term.names)]

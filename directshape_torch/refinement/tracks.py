@@ -15,6 +15,7 @@ from directshape_torch.refinement.outcome import at_states, going_on, judged, ou
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.solver.damped_solve import damped_step
+from directshape_torch.solver.differentiate import implicit_state, unrolled_state
 from directshape_torch.solver.gauss_newton import Minimum, minimise
 from directshape_torch.solver.problem import put_rows, take_rows
 from directshape_torch.solver.sharing import Groups, said_of_shared
@@ -97,8 +98,6 @@ def _attached(problem: CarProblem, cars: CarBatch, start: CarState, minimum: Min
     rows = refined.nonzero()[:, 0]
     if not torch.is_grad_enabled() or not len(rows):
         return minimum.state
-    from directshape_torch.solver.differentiate import implicit_state, unrolled_state
-
     part, backward, names = problem.of_problems(refined), problem.config.backward, cars.detection_row[rows]
     if backward.mode == "unroll":
         first = take_rows(start, rows)

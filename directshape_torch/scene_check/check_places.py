@@ -16,7 +16,7 @@ from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence
 from directshape_torch.scene_check.conventions import projected_boxes
 from directshape_torch.scene_check.finding import Finding, Severity, found, of_cars
 from directshape_torch.shape.pca_prior import PCAShapePrior
-from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
+from directshape_torch.shape.zero_level import sdf_to_mesh
 
 # The visible surface lies before the centre by about a third of the box's depth.
 _SURFACE_SHARE = 0.33

@@ -13,6 +13,10 @@ from directshape_torch.rows import PointSamples
 from directshape_torch.scene import Detections, FrameBatch
 
 _MASK_THRESHOLD = 0.5
+# Above the ground plane: lower points are road, higher ones trees.
+_HEIGHTS_M = (0.1, 3.0)
+# Of the detection's centre, along the ground: a long car's half and what a detector is wrong by.
+_REACH_M = 2.5
 
 
 def car_points(frames: FrameBatch, detections: Detections, config: PointCloudConfig) -> PointSamples:
@@ -21,7 +25,7 @@ def car_points(frames: FrameBatch, detections: Detections, config: PointCloudCon
     Args:
         frames: F frames with disparity.
         detections: B cars with finite or NaN poses; a car without a pose has no points.
-        config: pixels, filters, numbers.
+        config: how many points a car has at most.
 
     Returns:
         The points, differentiable by the disparity.
@@ -32,7 +36,7 @@ def car_points(frames: FrameBatch, detections: Detections, config: PointCloudCon
     disparity = frames.disparity
     if disparity is None:
         raise InputError("frames.disparity", "a disparity map of each frame", "None", "use with_disparity")
-    pixels = _pixels(frames, detections, config)
+    pixels = _pixels(frames, detections)
     object_index, v, u = (pixels & _known(disparity)[detections.frame_index]).nonzero(as_tuple=True)
     frame = detections.frame_index[object_index]
     camera = frames.camera
@@ -44,23 +48,23 @@ def car_points(frames: FrameBatch, detections: Detections, config: PointCloudCon
         camera.T_right_cam[frame],
         camera.disparity_field,
     )
-    passed = _passes(frames, detections, config, object_index, points_cam.detach()).nonzero()[:, 0]
+    passed = _passes(frames, detections, object_index, points_cam.detach()).nonzero()[:, 0]
     object_index, points_cam = object_index[passed], points_cam[passed]
     counts = occurrences(object_index, len(detections))
     kept = every_nth(object_index, counts, config.max_points)
     return PointSamples(object_index[kept], points_cam[kept], counts)
 
 
-def _pixels(frames: FrameBatch, d: Detections, config: PointCloudConfig) -> Tensor:
+def _pixels(frames: FrameBatch, d: Detections) -> Tensor:
     """Left pixels (B, H, W) of each car: of its mask where it has one, else of its 2D box."""
     height, width = frames.images_left.shape[2:]
     u, v = (torch.arange(n, device=d.box_2d.device) for n in (width, height))
     u_min, v_min, u_max, v_max = d.box_2d[:, :, None].unbind(1)
     rows, columns = frames.sizes[d.frame_index, :, None].unbind(1)
     in_box = _grid((v >= v_min) & (v <= v_max), (u >= u_min) & (u <= u_max))
-    masked = (d.mask_left > _MASK_THRESHOLD) if config.pixels == "mask" else in_box
+    chosen = torch.where(d.has_mask_left[:, None, None], d.mask_left > _MASK_THRESHOLD, in_box)
     # Whatever the padding of a smaller frame holds is no part of it.
-    return torch.where(d.has_mask_left[:, None, None], masked, in_box) & _grid(v < rows, u < columns)
+    return chosen & _grid(v < rows, u < columns)
 
 
 def _grid(of_row: Tensor, of_column: Tensor) -> Tensor:
@@ -73,17 +77,16 @@ def _known(disparity: Tensor) -> Tensor:
     return disparity.isfinite() & (disparity > 0)
 
 
-def _passes(
-    frames: FrameBatch, detections: Detections, config: PointCloudConfig, object_index: Tensor, points_cam: Tensor
-) -> Tensor:
+def _passes(frames: FrameBatch, detections: Detections, object_index: Tensor, points_cam: Tensor) -> Tensor:
     """Which points (P,) are above the ground and near the detection; NaN fails every comparison."""
     frame = detections.frame_index[object_index]
     normal = frames.ground.normal[frame]
     height = (normal * points_cam).sum(-1) + frames.ground.offset[frame]
     offset = points_cam - detections.T_cam_obj[object_index, :3, 3]
     along_ground = offset - (offset * normal).sum(-1, keepdim=True) * normal
-    near: Tensor = along_ground.norm(dim=-1) <= config.max_distance_m
-    return near & (height >= config.min_height_m) & (height <= config.max_height_m)
+    near: Tensor = along_ground.norm(dim=-1) <= _REACH_M
+    lowest, highest = _HEIGHTS_M
+    return near & (height >= lowest) & (height <= highest)
 
 
 def every_nth(object_index: Tensor, counts: Tensor, most: int) -> Tensor:

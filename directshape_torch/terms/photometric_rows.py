@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,11 +18,8 @@ from directshape_torch.config import PhotometricConfig
 from directshape_torch.image.grey_levels import GreyPair
 from directshape_torch.image.interpolate import BilinearPatch, bilinear_patch
 from directshape_torch.numerics.tensors import all_along, made_once
-from directshape_torch.rows import PixelSamples, Rays, Rows
+from directshape_torch.rows import OcclusionMap, PixelSamples, Rays, Rows
 from directshape_torch.terms.cars import CarBatch
-
-if TYPE_CHECKING:
-    from directshape_torch.observation.occlusion import OcclusionMap
 
 PatchForm = Literal["plain", "zero_mean", "normalised"]
 

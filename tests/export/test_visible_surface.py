@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from directshape_torch.evaluation.shape_error import EstimatedCar
 from directshape_torch.export.painted_cars import FrameView
 from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
+from directshape_torch.shape.zero_level import sdf_to_mesh
 from directshape_torch.visualize.drawing import View
 
 K = np.array([[150.0, 0.0, 77.0], [0.0, 150.0, 50.0], [0.0, 0.0, 1.0]])

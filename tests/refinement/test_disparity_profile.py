@@ -65,7 +65,6 @@ def test_the_minimum_is_where_the_right_image_was_moved_to(shift_px: int) -> Non
     profile = profile_at(stage, state, state)
     torch.testing.assert_close(profile.after.offset_px, torch.full((2,), float(shift_px)).double(), atol=0.05, rtol=0)
     assert torch.equal(profile.cost_before, profile.cost_after)
-    assert profile.after.in_basin.all()
     assert not profile.after.ambiguous.any()
     assert (profile.after.sigma_px < 0.1).all()
 
@@ -91,37 +90,31 @@ def test_a_parabola_by_hand() -> None:
     assert found["offset_px"] == pytest.approx(0.6)
     assert found["sigma_px"] == pytest.approx(math.sqrt(4 / 600))
     assert found["distinctness"] == math.inf
-    assert (found["in_basin"], found["ambiguous"]) == (1, 0)
+    assert found["ambiguous"] == 0
 
 
 def test_two_valleys_by_hand() -> None:
-    """Depth 4 at 0 and depth 1 at 2 px, with a ridge between: another basin; 4 / 1 apart, and 1.1 / 1."""
+    """Depth 4 at 0 and depth 1 at 2 px, with a ridge between: 4 / 1 apart, and 1.1 / 1."""
     valleys = torch.minimum(4 + 10 * OFFSETS**2, 1 + 10 * (OFFSETS - 2) ** 2)
     found = _figures(valleys)
     assert found["offset_px"] == pytest.approx(2.0)
     assert found["distinctness"] == pytest.approx(4.0)
-    assert (found["in_basin"], found["ambiguous"]) == (0, 0)
-    mirrored = _figures(valleys.flip(0))
-    assert (mirrored["offset_px"], mirrored["in_basin"]) == (pytest.approx(-2.0), 0)
+    assert found["ambiguous"] == 0
+    assert _figures(valleys.flip(0))["offset_px"] == pytest.approx(-2.0)
     close = _figures(torch.minimum(1 + 10 * OFFSETS**2, 1.1 + 10 * (OFFSETS - 2) ** 2))
     assert close["distinctness"] == pytest.approx(1.1)
-    assert (close["in_basin"], close["ambiguous"]) == (1, 1)
+    assert close["ambiguous"] == 1
 
 
-def test_a_dent_beside_the_minimum_is_no_other_minimum_and_a_ripple_no_ridge() -> None:
+def test_a_dent_beside_the_minimum_is_no_other_minimum() -> None:
     dented = 5 + OFFSETS**2
     dented[OFFSETS == 0.5] = 5.02
     assert _figures(dented)["distinctness"] == math.inf
-    rippled = 5 + (OFFSETS - 2) ** 2
-    rippled[OFFSETS == 1.0] += 0.6
-    assert _figures(rippled)["in_basin"] == 1
-    rippled[OFFSETS == 1.0] += 0.3
-    assert _figures(rippled)["in_basin"] == 0
 
 
 def test_a_curve_that_falls_to_its_end_has_no_width() -> None:
     found = _figures(10 - OFFSETS)
-    assert (found["offset_px"], found["sigma_px"], found["in_basin"]) == (3.0, math.inf, 1)
+    assert (found["offset_px"], found["sigma_px"]) == (3.0, math.inf)
     for height in (7.0, 0.0):  # zero: images without any texture
         flat = _figures(torch.full_like(OFFSETS, height))
         assert (flat["sigma_px"], flat["distinctness"], flat["ambiguous"]) == (math.inf, 1.0, 1)
@@ -131,7 +124,7 @@ def test_no_curve_says_nothing() -> None:
     found = profile_figures(OFFSETS, torch.full((1, 25), torch.nan).double(), torch.tensor([0.0]).double())
     for figure in (found.offset_px, found.sigma_px, found.distinctness):
         assert figure.isnan().all()
-    assert not (found.in_basin | found.ambiguous).any()
+    assert not found.ambiguous.any()
 
 
 def test_in_a_result_each_car_has_its_own_curve_and_cars_that_were_not_refined_have_none() -> None:

@@ -6,7 +6,7 @@ from helpers.priors import first_components
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.shape.pca_fit import fit_pca
 from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
-from directshape_torch.shape.sdf_grid import zero_level_extents
+from directshape_torch.shape.zero_level import zero_level_extents
 
 MADE = PriorProvenance("a test", "Apache-2.0", 40)
 SPACING_M = 0.2

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.shape.field import PackedField, field_of
-from directshape_torch.shape.sdf_grid import GridField, GridShape, Lookup, zero_level_extents
+from directshape_torch.shape.sdf_grid import GridField, GridShape, Lookup
+from directshape_torch.shape.zero_level import zero_level_extents
 
 ORIGIN = torch.tensor([-1.0, -2.0, 0.5], dtype=torch.float64)
 SPACING = 0.4

@@ -14,9 +14,17 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.rows import PointSamples
+from directshape_torch.terms import car_points as points_of_cars
 from directshape_torch.terms.car_points import car_points
 
-ALL = PointCloudConfig(min_points=1, max_points=100_000, min_height_m=-1.0, max_distance_m=5.0)
+ALL = PointCloudConfig(min_points=1, max_points=100_000)
+
+
+@pytest.fixture(autouse=True)
+def wide(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Limits that leave out no point of the street, but where a test sets others."""
+    monkeypatch.setattr(points_of_cars, "_HEIGHTS_M", (-99.0, 99.0))
+    monkeypatch.setattr(points_of_cars, "_REACH_M", 1e3)
 
 
 def points_of(config: PointCloudConfig = ALL, **changes: object) -> PointSamples:
@@ -36,28 +44,34 @@ def test_every_masked_pixel_gives_a_point_on_the_surface() -> None:
     assert sdf.abs().max() < 1e-6
 
 
-def test_heights_are_above_the_plane() -> None:
-    points = points_of(replace(ALL, min_height_m=0.5, max_height_m=1.0))
+def test_heights_are_above_the_plane(monkeypatch: pytest.MonkeyPatch) -> None:
+    everything = CAMERA_HEIGHT_M - points_of().points_cam[:, 1]
+    monkeypatch.setattr(points_of_cars, "_HEIGHTS_M", (0.5, 1.0))
+    points = points_of()
     height = CAMERA_HEIGHT_M - points.points_cam[:, 1]
     assert 0.5 <= height.min() < 0.55
     assert 0.95 < height.max() <= 1.0
-    everything = CAMERA_HEIGHT_M - points_of().points_cam[:, 1]
     assert len(points.points_cam) == int(((everything >= 0.5) & (everything <= 1.0)).sum())
 
 
-def test_distances_are_along_the_ground_from_the_centre_of_the_detection() -> None:
+def test_distances_are_along_the_ground_from_the_centre_of_the_detection(monkeypatch: pytest.MonkeyPatch) -> None:
+    everything = points_of()
+    monkeypatch.setattr(points_of_cars, "_REACH_M", 1.6)
     detections = measured_street()[1].detections
     lifted = detections.T_cam_obj.clone()
     lifted[:, 1, 3] -= 7.0
-    points = points_of(replace(ALL, max_distance_m=1.6), T_cam_obj=lifted)
+    points = points_of(T_cam_obj=lifted)
     offset = (points.points_cam - detections.T_cam_obj[points.object_index, :3, 3])[:, [0, 2]].norm(dim=-1)
     assert 1.5 < offset.max() <= 1.6
-    assert 0 < len(points.points_cam) < len(points_of().points_cam)
+    assert 0 < len(points.points_cam) < len(everything.points_cam)
 
 
-def test_without_a_mask_or_by_option_the_box_counts() -> None:
+NO_MASK = torch.tensor([False, False])
+
+
+def test_without_a_mask_the_box_counts() -> None:
     detections = measured_street()[1].detections
-    box = points_of(replace(ALL, pixels="box"))
+    box = points_of(has_mask_left=NO_MASK)
     # Where the map knows nothing there is no point, so the first car's box holds its own pixels and some of the other.
     assert (box.counts >= points_of().counts).all()
     absent = torch.tensor([True, False])
@@ -65,7 +79,7 @@ def test_without_a_mask_or_by_option_the_box_counts() -> None:
     assert torch.equal(mixed.counts, torch.where(absent, points_of().counts, box.counts))
     narrow = detections.box_2d.clone()
     narrow[:, 2] = narrow[:, 0] + 4
-    assert (points_of(replace(ALL, pixels="box"), box_2d=narrow).counts < box.counts).all()
+    assert (points_of(has_mask_left=NO_MASK, box_2d=narrow).counts < box.counts).all()
 
 
 @pytest.mark.parametrize("unknown", [torch.nan, 0.0, -1.0, torch.inf])
@@ -84,9 +98,9 @@ def test_the_padding_of_a_smaller_frame_holds_no_points() -> None:
     assert scene.frames.disparity is not None
     filled = scene.frames.disparity.nan_to_num(nan=7.0)
     frames = replace(scene.frames, disparity=filled, sizes=torch.tensor([[80, 70]]))
-    everywhere = replace(scene.detections, box_2d=torch.tensor([[0.0, 0.0, 159.0, 119.0]]).double().expand(2, 4))
-    wide = replace(ALL, pixels="box", max_distance_m=1e3, min_height_m=-99.0, max_height_m=99.0)
-    assert car_points(frames, everywhere, wide).counts.tolist() == [80 * 70] * 2
+    box_2d = torch.tensor([[0.0, 0.0, 159.0, 119.0]]).double().expand(2, 4)
+    everywhere = replace(scene.detections, has_mask_left=NO_MASK, box_2d=box_2d)
+    assert car_points(frames, everywhere, ALL).counts.tolist() == [80 * 70] * 2
 
 
 def test_of_too_many_every_nth_is_kept() -> None:

@@ -8,7 +8,7 @@ import trimesh
 from directshape_torch.errors import DataFormatError, InputError, MeshError
 from directshape_torch.geometry import se3
 from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
-from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
+from directshape_torch.shape.zero_level import sdf_to_mesh
 
 X = torch.linspace(-1.2, 1.2, 25, dtype=torch.float64)
 NODES = torch.stack(torch.meshgrid(X, X, X, indexing="ij"), dim=-1)

@@ -1,0 +1,107 @@
+"""The surface of signed distance grids: the box around their zero level, and its triangle mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from directshape_torch.errors import InputError, MeshError
+from directshape_torch.numerics.checks import check_shape
+
+if TYPE_CHECKING:
+    import trimesh
+
+
+def zero_level_extents(
+    values: Tensor,  # (B, nx, ny, nz)
+    origin: Tensor,  # (3,)
+    spacing_m: float,
+) -> Tensor:  # (B, 2, 3)
+    """Lower and upper corner (B, 2, 3) of the box around the zero level, metres; NaN along an axis without a crossing.
+
+    The field is trilinear between nodes, so along an axis the outermost point of its zero level lies on a grid edge
+    parallel to that axis (up to cells that the level only touches in their middle): the extent is the outermost linear
+    crossing of all edges of the axis. Differentiable by `values`: the gradient flows through the outermost edge.
+
+    Examples:
+        >>> x = torch.arange(-3.0, 4.0)
+        >>> sphere = torch.stack(torch.meshgrid(x, x, x, indexing="ij"), -1).norm(dim=-1) - 2.5
+        >>> zero_level_extents(sphere[None], torch.full((3,), -3.0), 1.0)[0, 1]
+        tensor([2.5000, 2.5000, 2.5000])
+    """
+    if values.ndim != 4:
+        raise InputError("values", "shape (B, nx, ny, nz)", str(tuple(values.shape)))
+    lower_upper = [_extent_along(values, axis) for axis in (1, 2, 3)]
+    return origin + spacing_m * torch.stack([torch.stack(pair, dim=-1) for pair in lower_upper], dim=-1)
+
+
+def _extent_along(values: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+    """First and last crossing (B,), (B,) over all edges of one axis, in nodes; NaN where there is none."""
+    count = values.shape[axis]
+    before, after = values.narrow(axis, 0, count - 1), values.narrow(axis, 1, count - 1)
+    crosses = (before < 0) != (after < 0)
+    drop = torch.where(crosses, before - after, torch.ones_like(before))
+    shape = [1, 1, 1, 1]
+    shape[axis] = count - 1
+    node = torch.arange(count - 1, dtype=values.dtype, device=values.device).reshape(shape)
+    position = node + before / drop
+    nothing = torch.full_like(position, float("inf"))
+    first = torch.where(crosses, position, nothing).flatten(1).amin(dim=1)
+    last = torch.where(crosses, position, -nothing).flatten(1).amax(dim=1)
+    found = crosses.flatten(1).any(dim=1)
+    nan = torch.full_like(first, float("nan"))
+    return torch.where(found, first, nan), torch.where(found, last, nan)
+
+
+def sdf_to_mesh(
+    values: Tensor,  # (nx, ny, nz)
+    origin: Tensor,  # (3,)
+    spacing_m: float,
+    T_cam_obj: Tensor | None = None,  # (4, 4)
+    level_m: float = 0.0,
+) -> trimesh.Trimesh:
+    """Closed mesh of a level of a signed distance grid, in camera coordinates, normals outward.
+
+    Args:
+        values: signed distance at the nodes, metres, negative inside.
+        origin: node (0, 0, 0) in the object frame, metres.
+        spacing_m: distance between nodes.
+        T_cam_obj: object to camera; None leaves the mesh in the object frame.
+        level_m: which level; 0 is the surface. Where it leaves the grid the mesh is closed at the grid's border.
+
+    Raises:
+        InputError: wrong shapes.
+        MeshError: the field does not cross the level.
+
+    Examples:
+        >>> import torch
+        >>> x = torch.linspace(-1, 1, 21)
+        >>> radius = torch.stack(torch.meshgrid(x, x, x, indexing="ij"), -1).norm(dim=-1)
+        >>> ball = sdf_to_mesh(radius - 0.5, torch.full((3,), -1.0), 0.1)
+        >>> bool(abs(ball.volume - 4 / 3 * np.pi * 0.5**3) < 0.02)
+        True
+    """
+    import trimesh
+    from skimage.measure import marching_cubes
+
+    check_shape("values", values, ("nx", "ny", "nz"))
+    check_shape("origin", origin, (3,))
+    above = values.detach().double().cpu().numpy() - level_m
+    if not ((above < 0).any() and (above > 0).any()):
+        raise MeshError(f"the signed distance grid does not cross the level {level_m} m: it has no surface to mesh")
+    # Closed at the border by one more node, outside. "descent": the field falls towards the object, so that the faces'
+    # normals point outward.
+    padded = np.pad(above, 1, constant_values=spacing_m)
+    extract: Callable[..., tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]] = marching_cubes
+    vertices, faces, _, _ = extract(padded, 0.0, spacing=(spacing_m,) * 3, gradient_direction="descent")
+    vertices = vertices.astype(np.float64) - spacing_m + origin.detach().double().cpu().numpy()
+    if T_cam_obj is not None:
+        check_shape("T_cam_obj", T_cam_obj, (4, 4))
+        T = T_cam_obj.detach().double().cpu().numpy()
+        vertices = vertices @ T[:3, :3].T + T[:3, 3]
+    return trimesh.Trimesh(vertices, faces.astype(np.int64), process=False)
