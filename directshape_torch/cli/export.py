@@ -11,14 +11,14 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from directshape_torch.cli.options import add_run_inputs, dataset_of_run, has_detections, mask_source, prior_of_run
+from directshape_torch.cli.options import add_run_inputs, inputs_of_run, mask_source
 from directshape_torch.cli.progress import ProgressBar
 from directshape_torch.errors import InputError
 from directshape_torch.export.export_run import FORMATS, export_run
-from directshape_torch.export.frame_source import ExportInputs
+from directshape_torch.export.frame_source import ExportOptions
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.visualize.run_frames import RunInputs
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -50,32 +50,25 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Export and say where to."""
     folder = RunFolder(args.run_folder, args.frames)
-    inputs = _make_inputs(args, folder)
+    inputs = inputs_of_run(args, folder)
+    options = _make_options(args, inputs)
     with ProgressBar("export") as progress:
-        export_run(folder, args.out, args.format, inputs, progress)
+        export_run(inputs, args.out, args.format, options, progress)
     print(f"exported  {len(folder.frame_ids)} frames as {', '.join(dict.fromkeys(args.format))} to {args.out}")
     return 0
 
 
-def _make_inputs(args: argparse.Namespace, folder: RunFolder) -> ExportInputs:
-    prior, dataset = prior_of_run(args.prior, folder), dataset_of_run(args, folder)
+def _make_options(args: argparse.Namespace, inputs: RunInputs) -> ExportOptions:
     needs_rig = args.iterations or "points" in args.format
-    lacks_rig = dataset is not None and not dataset.disparity_fields
-    if needs_rig and lacks_rig and folder.manifest.sha256["stereo_bias"] is not None:
+    lacks_rig = inputs.dataset is not None and not inputs.dataset.disparity_fields
+    if needs_rig and lacks_rig and inputs.run.manifest.sha256["stereo_bias"] is not None:
         purpose = "stereo points" if "points" in args.format else "--iterations"
         raise InputError("--rig", f"the file that the run was made with, for {purpose}", "nothing")
-    return ExportInputs(
-        prior,
-        dataset,
-        args.data,
-        has_detections=has_detections(args),
-        refiner=_make_refiner(args, folder, prior) if args.iterations else None,
-        mirror=args.unseen == "mirror",
-        points_per_car=args.points,
-    )
+    refiner = _make_refiner(args, inputs) if args.iterations else None
+    return ExportOptions(args.data, refiner, args.unseen == "mirror", args.points)
 
 
-def _make_refiner(args: argparse.Namespace, folder: RunFolder, prior: ShapePrior | None) -> DirectShapeRefiner:
+def _make_refiner(args: argparse.Namespace, inputs: RunInputs) -> DirectShapeRefiner:
     """The refiner of the run, on the processor and not compiled: a few frames are not worth it."""
     if "rerun" not in args.format:
         raise InputError("--iterations", "--format rerun, which alone records them", " ".join(args.format))
@@ -83,6 +76,6 @@ def _make_refiner(args: argparse.Namespace, folder: RunFolder, prior: ShapePrior
     for name, value in given.items():
         if value is None and (name == "data" or args.layout != "folder"):
             raise InputError(f"--{name}", "that of the run, for --iterations", "nothing")
-    if prior is None:
+    if inputs.prior is None:
         raise InputError("--prior", "the shape prior of the run", "nothing")
-    return DirectShapeRefiner(prior, replace(folder.refiner_config(), compile="off"))
+    return DirectShapeRefiner(inputs.prior, replace(inputs.run.refiner_config(), compile="off"))

@@ -25,6 +25,7 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.rig_file import RIG_FILE, load_fields
 from directshape_torch.shape.load_prior import BUNDLED_PRIORS, load_prior
 from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.visualize.run_frames import RunInputs
 
 _EITHER = "either a folder (--masks DIR) or COCO files (--masks-left FILE, --masks-right FILE)"
 
@@ -223,9 +224,11 @@ def dataset_of_run(args: argparse.Namespace, run: RunFolder) -> StereoDataset | 
     )
 
 
-def has_detections(args: argparse.Namespace) -> bool:
-    """Whether the detections of the data set are those of the run; a plain folder keeps them beside its images."""
-    return args.layout == "folder" or args.detections is not None
+def inputs_of_run(args: argparse.Namespace, run: RunFolder) -> RunInputs:
+    """The chosen frames of a run and what the options say went into them; a plain folder keeps its detections."""
+    dataset = dataset_of_run(args, run) if run.frame_ids else None
+    has_detections = args.layout == "folder" or args.detections is not None
+    return RunInputs(run, prior_of_run(args.prior, run), dataset, has_detections)
 
 
 def prior_of_run(source: str | None, run: RunFolder) -> ShapePrior | None:

@@ -12,7 +12,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from directshape_torch.cli.options import add_run_inputs, dataset_of_run, has_detections, prior_of_run
+from directshape_torch.cli.options import add_run_inputs, inputs_of_run
 from directshape_torch.cli.progress import ProgressBar
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.report.make_report import make_report
@@ -34,12 +34,9 @@ def run(args: argparse.Namespace) -> int:
     """Write the page and say how large it is."""
     run_folder = RunFolder(args.out, args.frames)
     page = args.out / "report.html" if args.html is None else args.html
-    dataset = dataset_of_run(args, run_folder) if run_folder.frame_ids else None
-    prior, given = prior_of_run(args.prior, run_folder), has_detections(args)
+    inputs = inputs_of_run(args, run_folder)
     with ProgressBar("report") as progress:
-        outcome = make_report(
-            run_folder, page, dataset, prior, has_detections=given, most_frames=args.max_frames, observer=progress
-        )
+        outcome = make_report(inputs, page, most_frames=args.max_frames, observer=progress)
     for note in outcome.notes:
         print(f"note: {note}", file=sys.stderr)
     print(f"page     {outcome.path}  {outcome.num_bytes / 1e6:.1f} MB")

@@ -23,8 +23,8 @@ class KittiExporter(Exporter):
     """`kitti/data/NNNNNN.txt`, the result file byte for byte, and all its lines as `kitti/json/NNNNNN.json`."""
 
     def add(self, source: FrameSource) -> None:
-        frame, frame_id, folder = source.refined, source.frame_id, self.folder / "kitti"
-        write_bytes(folder / "data" / f"{frame_id}.txt", read_bytes(result_path(self.run.path, frame_id)))
+        frame, frame_id, folder = source.result, source.frame_id, self.folder / "kitti"
+        write_bytes(folder / "data" / f"{frame_id}.txt", read_bytes(result_path(self.inputs.run.path, frame_id)))
         content = {
             "schema": "directshape kitti results",
             "schema_version": 1,
@@ -100,7 +100,7 @@ class Coco3dExporter(Exporter):
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
-        self.image_ids = image_numbers(self.run.frame_ids)
+        self.image_ids = image_numbers(self.inputs.run.frame_ids)
         self.category_ids = {name: number for number, name in enumerate(KITTI_TYPES, start=1)}
         self.images: list[dict[str, Any]] = []
         self.annotations: list[dict[str, Any]] = []
@@ -112,7 +112,7 @@ class Coco3dExporter(Exporter):
         image = {"id": self.image_ids[source.frame_id], "dataset_id": 0, "width": width, "height": height}
         fixed = {"K": K_left.tolist(), "src_90_rotate": 0, "src_flagged": False}
         self.images.append({**image, "file_path": _image_path(source), **fixed})
-        for one in source.refined.objects:
+        for one in source.result.objects:
             name = one.line.type
             category_id = self.category_ids.setdefault(name, len(self.category_ids) + 1)
             ids = {"id": len(self.annotations) + 1, "image_id": image["id"], "category_id": category_id}
@@ -128,7 +128,7 @@ class Coco3dExporter(Exporter):
 
 def _image_path(source: FrameSource) -> str:
     """The left image, from the root of the data set where that is known."""
-    dataset, root = source.inputs.dataset, source.inputs.data_root
+    dataset, root = source.inputs.dataset, source.options.data_root
     if dataset is None:
         raise InputError("--data", "the data set of the run, for the names of its images", "nothing")
     path = dataset.input_files(source.frame_id)["image_left"]
@@ -208,7 +208,7 @@ class NuscenesExporter(Exporter):
         self.samples: dict[str, list[dict[str, Any]]] = {}
 
     def add(self, source: FrameSource) -> None:
-        known = [one for one in source.refined.objects if one.line.type in DETECTION_NAMES]
+        known = [one for one in source.result.objects if one.line.type in DETECTION_NAMES]
         best = sorted(known, key=_score, reverse=True)[:_MOST_BOXES]
         self.samples[source.frame_id] = [_box(source.frame_id, one) for one in best]
 

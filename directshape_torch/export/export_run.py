@@ -9,11 +9,10 @@ from pathlib import Path
 from directshape_torch.batch.options import RunObserver
 from directshape_torch.errors import InputError
 from directshape_torch.export.box_files import Coco3dExporter, KittiExporter, NuscenesExporter
-from directshape_torch.export.frame_source import Exporter, ExportInputs, FrameSource
+from directshape_torch.export.frame_source import Exporter, ExportOptions, FrameSource
 from directshape_torch.export.rerun_recording import RerunExporter
 from directshape_torch.export.surface_files import GlbExporter, PlyExporter, PointsExporter
-from directshape_torch.io.run_folder import RunFolder
-from directshape_torch.io.run_manifest import hash_prior
+from directshape_torch.visualize.run_frames import RunInputs
 
 FORMATS: dict[str, type[Exporter]] = {
     "glb": GlbExporter,
@@ -28,42 +27,43 @@ FORMATS: dict[str, type[Exporter]] = {
 
 
 def export_run(
-    run: RunFolder,
+    inputs: RunInputs,
     folder: Path | str,
     formats: Sequence[str],
-    inputs: ExportInputs,
+    options: ExportOptions | None = None,
     observer: RunObserver | None = None,
 ) -> None:
     """Write the finished frames of a run in other formats (docs/outputs.md). The run itself is only read.
 
     Args:
-        run: which frames of which output folder.
+        inputs: which frames of which output folder, shape prior, and the images for colours.
         folder: gets `glb`, `ply`, `points`, `kitti`, `coco3d.json`, `nuscenes.json`, `recording.rrd`; files of an
             earlier export that have the same names are replaced.
         formats: of `FORMATS`.
-        inputs: shape priors, and the images for colours.
+        options: looks and details.
         observer: is told of each frame.
 
     Raises:
         MissingDependencyError: "rerun" without Rerun.
         InputError: an unknown format, or one that needs images which were not given.
-        DataFormatError: a file of the run or of the data set is missing or damaged.
+        DataFormatError: a file of the run or of the data set is missing, damaged or not that of the run.
     """
+    run, options = inputs.run, ExportOptions() if options is None else options
     if not run.frame_ids:
         raise InputError("frames", f"finished frames of {run.path}", "none")
     if unknown := [name for name in formats if name not in FORMATS]:
         raise InputError("formats", f"of {', '.join(FORMATS)}", repr(unknown[0]))
-    if inputs.prior is not None and hash_prior(inputs.prior) != run.manifest.sha256["prior"]:
-        raise InputError("prior", "that of the run", "another one", "name that of the run with --prior")
+    if options.refiner is not None and not inputs.has_detections:
+        raise InputError("detections", "those of the run, to refine its frames again", "none")
     observer = RunObserver() if observer is None else observer
-    exporters = [FORMATS[name](Path(folder), run, inputs) for name in dict.fromkeys(formats)]
+    exporters = [FORMATS[name](Path(folder), inputs, options) for name in dict.fromkeys(formats)]
     with ExitStack() as stack:
         for exporter in exporters:
             stack.callback(exporter.abandon)
         observer.started(run.frame_ids)
         for frame_id in run.frame_ids:
             # What is read or made of a frame serves all of them.
-            source = FrameSource(run, frame_id, inputs)
+            source = FrameSource(inputs, frame_id, options)
             for exporter in exporters:
                 exporter.add(source)
             observer.finished(frame_id, None)

@@ -1,4 +1,4 @@
-"""What the exports of one frame are made of, read or made when the first of them asks."""
+"""What the exports of one frame are made of, and what an exporter is."""
 
 from __future__ import annotations
 
@@ -6,25 +6,19 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from directshape_torch.errors import InputError
+from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.export.painted_cars import PaintedFrame
-from directshape_torch.io.run_folder import FrameResult, RunFolder
-from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
+from directshape_torch.io.run_folder import result_path
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.visualize.run_frames import RunFrame, RunInputs
 
 
 @dataclass(frozen=True)
-class ExportInputs:
-    """What an export may use beside the run itself."""
+class ExportOptions:
+    """What is chosen of an export."""
 
-    prior: ShapePrior | None = None  # the shapes of the run; None: exports without surfaces
-    # Images, calibrations, masks and detections of the run's frames; None: exports without colours, and none that need
-    # an image.
-    dataset: StereoDataset | None = None
     data_root: Path | None = None  # folder that names of images begin in, where a file lists them
-    # Whether the detections of that data set are those of the run; else its results stand for them.
-    has_detections: bool = False
     # Repeats the refinement, for the iterations in a recording; then the detections must be the run's.
     refiner: DirectShapeRefiner | None = None
     mirror: bool = True  # colour what the image does not show by the other side of the car
@@ -33,31 +27,32 @@ class ExportInputs:
     def __post_init__(self) -> None:
         if self.points_per_car < 1:
             raise InputError("points_per_car", "at least 1", str(self.points_per_car))
-        if self.refiner is not None and not self.has_detections:
-            raise InputError("detections", "those of the run, to refine its frames again", "none")
 
 
-class FrameSource:
-    """One finished frame of a run."""
+class FrameSource(RunFrame):
+    """One finished frame of a run for all of its exporters."""
 
-    def __init__(self, run: RunFolder, frame_id: str, inputs: ExportInputs) -> None:
-        self.run, self.frame_id, self.inputs = run, frame_id, inputs
-
-    @cached_property
-    def refined(self) -> FrameResult:
-        """Boxes, states and shapes."""
-        return self.run.read(self.frame_id)
+    def __init__(self, inputs: RunInputs, frame_id: str, options: ExportOptions) -> None:
+        super().__init__(inputs, frame_id)
+        self.options = options
 
     @cached_property
-    def loaded(self) -> LoadedFrame | None:
-        """Images, calibration and masks, or None where no data set was given."""
-        return None if self.inputs.dataset is None else self.inputs.dataset.load(self.frame_id)
+    def images(self) -> LoadedFrame | None:
+        """Images, calibration and masks, or None where no data set was given.
+
+        Raises:
+            DataFormatError: they are not those of the run.
+        """
+        if self.loaded is None and self.inputs.dataset is not None:
+            problems = ", ".join(sorted(self.inputs.problems))
+            raise DataFormatError(result_path(self.inputs.run.path, self.frame_id), f"cannot be exported: {problems}")
+        return self.loaded
 
     @property
     def with_images(self) -> LoadedFrame:
         """The same, for an exporter that asked for a data set."""
-        assert self.loaded is not None, "no data set"
-        return self.loaded
+        assert self.images is not None, "no data set"
+        return self.images
 
     @cached_property
     def painted(self) -> PaintedFrame:
@@ -68,7 +63,7 @@ class FrameSource:
         """
         if self.inputs.prior is None:
             raise InputError("--prior", "the shape prior of the run", "nothing")
-        return PaintedFrame(self.refined, self.inputs.prior, self.loaded, self.inputs.mirror)
+        return PaintedFrame(self.result, self.inputs.prior, self.images, self.options.mirror)
 
 
 class Exporter:
@@ -80,10 +75,10 @@ class Exporter:
 
     needs_images_for = ""  # what the images are for, where it cannot do without
 
-    def __init__(self, folder: Path, run: RunFolder, inputs: ExportInputs) -> None:
+    def __init__(self, folder: Path, inputs: RunInputs, options: ExportOptions) -> None:
         if self.needs_images_for and inputs.dataset is None:
             raise InputError("--data", f"the data set of the run, for {self.needs_images_for}", "nothing")
-        self.folder, self.run, self.inputs = folder, run, inputs
+        self.folder, self.inputs, self.options = folder, inputs, options
 
     def add(self, source: FrameSource) -> None:
         """Take the next frame."""

@@ -55,11 +55,11 @@ class RerunExporter(Exporter):
     def __init__(self, *args: Any) -> None:
         _import_rerun()
         super().__init__(*args)
-        self.numbers, self.iteration = image_numbers(self.run.frame_ids), 0
+        self.numbers, self.iteration = image_numbers(self.inputs.run.frame_ids), 0
         self._stream: _Stream | None = None
 
     def add(self, source: FrameSource) -> None:
-        loaded, refiner = source.with_images, self.inputs.refiner
+        loaded, refiner = source.with_images, self.options.refiner
         if self._stream is None:
             # The images of the first frame say what the viewer's views are fitted to.
             height, width = loaded.frame.sizes[0].tolist()
@@ -75,7 +75,7 @@ class RerunExporter(Exporter):
         _clear_cars(stream)
         for index, one in enumerate(source.painted.objects):
             # Under one name through all frames of a track.
-            track = source.refined.shapes.tracks[one.car]
+            track = source.result.shapes.tracks[one.car]
             surface, paint = source.painted.mesh(index)
             stream.log_mesh(f"world/cars/{f'track_{track}' if track else one.line.line_number}", surface, paint.rgb)
         if refiner is not None:
@@ -152,9 +152,9 @@ def _log_boxes(stream: _Stream, source: FrameSource, loaded: LoadedFrame) -> Non
         stream.log_boxes(entity, poses_cam(lines, t_cam_ref).numpy(), hwl, [colour] * len(lines), labels)
 
     log_lines("world/boxes/before", loaded.detected_objects if source.inputs.has_detections else [], ORANGE)
-    classes = set(source.run.classes)
+    classes = set(source.inputs.run.classes)
     log_lines("world/boxes/truth", [o for o in loaded.labels or [] if o.has_box_3d and o.type in classes], GREEN)
-    cars = [one for one in source.refined.objects if one.car >= 0]
+    cars = [one for one in source.result.objects if one.car >= 0]
     T_cam_box = np.tile(np.eye(4), (len(cars), 1, 1))
     for T, one in zip(T_cam_box, cars, strict=True):
         T[:3, :3], T[:3, 3] = one.R_ref_obj, one.bottom_ref + t_cam_ref.numpy()

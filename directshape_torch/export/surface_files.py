@@ -38,7 +38,7 @@ class GlbExporter(Exporter):
         # Frames come sequence by sequence; a car keeps the picture of its nearest view until its own is over.
         self._write([key for key in self._moving if not source.frame_id.startswith(_sequence(key[0]))])
         painted = source.painted
-        write_bytes(self.folder / "glb" / f"{source.frame_id}.glb", frame_glb(painted, source.loaded))
+        write_bytes(self.folder / "glb" / f"{source.frame_id}.glb", frame_glb(painted, source.images))
         for index, one in enumerate(painted.objects):
             shapes = painted.frame.shapes
             key = shapes.tracks[one.car], int(shapes.track_parts[one.car])
@@ -229,7 +229,7 @@ class PointsExporter(Exporter):
         painted, measured = source.painted, source.painted.stereo_points()
         for index, one in enumerate(painted.objects):
             stem = self.folder / "points" / f"{source.frame_id}_{one.line.line_number}"
-            points_cam, normals_cam, paint = painted.samples(index, self.inputs.points_per_car)
+            points_cam, normals_cam, paint = painted.samples(index, self.options.points_per_car)
             write_bytes(f"{stem}.ply", _points_ply(points_cam, paint.rgb, normals_cam, paint.source))
             if one.line.line_number in measured:
                 write_bytes(f"{stem}_stereo.ply", _points_ply(*measured[one.line.line_number]))

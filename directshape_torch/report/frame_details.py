@@ -3,92 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.result_files import ShapeArrays
-from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.report.page_parts import FRAME_QUALITY, data_url, mesh_data, numbers
-from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.visualize.drawing import Surface, View, draw_box, draw_contour
-from directshape_torch.visualize.drawn_car import DrawnCar, cars_after, cars_before, corners_cam, true_corners
+from directshape_torch.visualize.drawing import View, draw_box, draw_contour
+from directshape_torch.visualize.drawn_car import DrawnCar
 from directshape_torch.visualize.residuals import ResidualMaps, draw_residuals
+from directshape_torch.visualize.run_frames import RunFrame
 
 _THUMBNAIL_PX = (360, 240)
 
 
-@dataclass(frozen=True)
-class FrameMaterial:
-    """One frame as far as it is known."""
-
-    result: FrameResult  # what the run left
-    loaded: LoadedFrame | None  # what went in
-    detections: list[KittiObject] | None  # the lines of its cars in the detection file
-    labels: list[KittiObject] | None  # the truth
-
-
-@dataclass(frozen=True)
-class DetailSettings:
-    """What all frames share."""
-
-    classes: Sequence[str]  # refined types
-    prior: ShapePrior | None  # shapes, or None where those of the run are not at hand
-    mean: Surface | None  # the mean one
-    config: RefinerConfig  # of the run
-
-
-def frame_details(material: FrameMaterial, settings: DetailSettings) -> dict[str, Any]:
+def frame_details(frame: RunFrame, config: RefinerConfig) -> dict[str, Any]:
     """Parts by name, each parsed by the page when it is first needed: pictures of each car; its residual maps, costs
     and disparity profile; and the 3D scene."""
-    shapes, t_cam_ref = material.result.shapes, _t_cam_ref(material.result.shapes)
-    before = None
-    if material.detections is not None:
-        before = cars_before(material.detections, t_cam_ref, settings.mean, shapes.codes.shape[1])
-    after = _cars_after(material.result, t_cam_ref, before, settings.prior)
+    shapes, before, after = frame.result.shapes, frame.before, frame.after
     cars = [{"after": now} if before is None else {"before": before[k], "after": now} for k, now in enumerate(after)]
-    view = None if material.loaded is None else View.of_frame(material.loaded.frame)
+    view = None if frame.loaded is None else View.of_frame(frame.loaded.frame)
     parts = [_part(view, states) for states in cars]
-    maps = _maps(parts, material.loaded, settings, cars)
+    maps = _maps(parts, frame, config, cars)
     return {
         "thumbnails": [_thumbnails(part, states) for part, states in zip(parts, cars, strict=True)],
         "maps": [{**_figures(shapes, car), "pictures": pictures} for car, pictures in enumerate(maps)],
         "scene": {
-            **_background(view, material.loaded),
+            **_background(view, frame.loaded),
             "ground_source": shapes.ground_source,
-            "truth": [
-                numbers(corners.reshape(-1), 3)
-                for corners in true_corners(material.labels, settings.classes, t_cam_ref)
-            ],
+            "truth": [numbers(corners.reshape(-1), 3) for corners in frame.truth_corners_cam],
             "cars": [_car(states.get("before"), states["after"]) for states in cars],
         },
     }
-
-
-def _cars_after(
-    result: FrameResult, t_cam_ref: Tensor, before: Sequence[DrawnCar] | None, prior: ShapePrior | None
-) -> list[DrawnCar]:
-    shapes = result.shapes
-    location_ref, rotation_y, hwl = (
-        torch.from_numpy(x) for x in (shapes.boxes_location_ref, shapes.boxes_rotation_y, shapes.boxes_hwl)
-    )
-    lines, corners = shapes.input_lines.tolist(), corners_cam(location_ref, rotation_y, hwl, t_cam_ref)
-    states = (lines, shapes.statuses, shapes.T_cam_obj, shapes.codes, corners)
-    return cars_after(*states, before, prior, result.mesh_files)
-
-
-def _t_cam_ref(shapes: ShapeArrays) -> Tensor:
-    """`x_cam = x_ref + t_cam_ref` (3,), float64, from the states themselves; zero for a frame without cars."""
-    if not len(shapes.input_lines):
-        return torch.zeros(3, dtype=torch.float64)
-    offset = shapes.T_cam_obj.astype(np.float64)[:, :3, 3] - shapes.T_ref_obj.astype(np.float64)[:, :3, 3]
-    return torch.from_numpy(np.median(offset, axis=0))
 
 
 def _part(view: View | None, states: dict[str, DrawnCar]) -> View | None:
@@ -127,16 +76,16 @@ def _figures(shapes: ShapeArrays, car: int) -> dict[str, Any]:
 
 def _maps(
     parts: Sequence[View | None],
-    loaded: LoadedFrame | None,
-    settings: DetailSettings,
+    frame: RunFrame,
+    config: RefinerConfig,
     cars: Sequence[dict[str, DrawnCar]],
 ) -> list[dict[str, str]]:
     """Maps of each car by the names "photometric_before" and so on, where images, masks and shapes are at hand."""
     pictures: list[dict[str, str]] = [{} for _ in cars]
     rows = [row for row, states in enumerate(cars) if states["after"].is_refined and parts[row] is not None]
-    if loaded is None or settings.prior is None or not rows:
+    if frame.loaded is None or frame.inputs.prior is None or not rows:
         return pictures
-    maps = ResidualMaps(loaded, settings.prior, settings.config, torch.tensor(rows))
+    maps = ResidualMaps(frame.loaded, frame.inputs.prior, config, torch.tensor(rows))
     for name in cars[rows[0]]:
         states = [cars[row][name] for row in rows]
         found = maps.of(np.stack([car.T_cam_obj for car in states]), np.stack([car.code for car in states]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
@@ -13,21 +13,18 @@ from typing import Any
 from directshape_torch.batch.options import RunObserver
 from directshape_torch.batch.run_log import read_log
 from directshape_torch.batch.run_status import read_status
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.errors import InputError
 from directshape_torch.evaluation.comparison import WORSE_BY_BEV_IOU
 from directshape_torch.files.atomic_files import replaced_file
 from directshape_torch.io.image_files import read_rgb
-from directshape_torch.io.run_folder import RunFolder, shapes_path
-from directshape_torch.io.run_manifest import flatten, hash_fields, hash_prior
-from directshape_torch.io.stereo_dataset import StereoDataset
+from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.io.run_manifest import flatten, hash_fields
 from directshape_torch.report.car_rows import CAR_COLUMNS, CarRow, car_rows, choose_frames
-from directshape_torch.report.frame_details import DetailSettings, FrameMaterial, frame_details
-from directshape_torch.report.frame_inputs import InputReader
+from directshape_torch.report.frame_details import frame_details
 from directshape_torch.report.page_parts import data_block, data_url, mesh_data, page_frame
 from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, load_rigs
-from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.status import Status
-from directshape_torch.visualize.drawn_car import mean_car
+from directshape_torch.visualize.run_frames import RunFrame, RunInputs
 
 
 @dataclass(frozen=True)
@@ -43,23 +40,14 @@ class ReportOutcome:
 
 
 def make_report(
-    run: RunFolder,
-    page: Path,
-    dataset: StereoDataset | None = None,
-    prior: ShapePrior | None = None,
-    *,
-    has_detections: bool = True,
-    most_frames: int = 100,
-    observer: RunObserver | None = None,
+    inputs: RunInputs, page: Path, *, most_frames: int = 100, observer: RunObserver | None = None
 ) -> ReportOutcome:
     """Write the page of the chosen frames of a run.
 
     Args:
-        run: the output folder of `directshape refine`.
+        inputs: which frames of the output folder of `directshape refine`, and what went in; without the shape prior
+            boxes alone, and saved meshes.
         page: the HTML file to write.
-        dataset: the frames of the run, for what went in.
-        prior: the shapes of the run; None, or another one than the run's: boxes alone, without meshes.
-        has_detections: whether the detections of the data set are those of the run.
         most_frames: frames with pictures and 3D views at most; all cars are in the table all the same.
         observer: is told of each frame with details.
 
@@ -70,21 +58,15 @@ def make_report(
     """
     if most_frames < 0:
         raise InputError("most_frames", "0 or more", str(most_frames))
+    run, mean, config = inputs.run, inputs.mean, inputs.run.refiner_config()
     observer = RunObserver() if observer is None else observer
-    prior_was_given = prior is not None
-    if prior is not None and run.manifest.sha256["prior"] != hash_prior(prior):
-        prior = None
-    # One for all frames and one for those with details: each counts what it could not use.
-    reader, detail_reader = (InputReader(dataset, dataset is not None and has_detections) for _ in range(2))
     rows: list[CarRow] = []
     grounds: Counter[str] = Counter()
     for number, frame_id in enumerate(run.frame_ids):
-        known = _known(run, reader, frame_id)
-        grounds[known.result.shapes.ground_source] += 1
-        rows += car_rows(number, known.result, known.detections, known.labels)
+        frame = RunFrame(inputs, frame_id)
+        grounds[frame.result.shapes.ground_source] += 1
+        rows += car_rows(number, frame.result, frame.detections, frame.labels)
     detailed = choose_frames(rows, len(run.frame_ids), most_frames)
-    mean = None if prior is None else mean_car(prior)
-    settings = DetailSettings(run.classes, prior, mean, run.refiner_config())
     head, foot = page_frame(f"{run.path.resolve().name}: refined cars")
     observer.started([run.frame_ids[number] for number in detailed])
     with replaced_file(page) as content, TextIOWrapper(content, "utf-8", "replace", newline="\n") as file:
@@ -92,18 +74,10 @@ def make_report(
         if mean is not None:
             file.write(data_block("mean-mesh", mesh_data(mean.vertices, mean.faces)))
         for number in detailed:
-            known = _known(run, reader, run.frame_ids[number])
-            material = replace(known, loaded=detail_reader.read(known.result))
-            for part, value in frame_details(material, settings).items():
+            for part, value in frame_details(RunFrame(inputs, run.frame_ids[number]), config).items():
                 file.write(data_block(f"{part}-{number}", value))
             observer.finished(run.frame_ids[number], None)
-        for what in reader.problems:  # said of all frames
-            detail_reader.problems.pop(what, None)
-        notes = [
-            *_notes(run, reader, prior, prior_was_given, len(detailed)),
-            *reader.notes(len(run.frame_ids)),
-            *detail_reader.notes(len(detailed)),
-        ]
+        notes = _notes(inputs, len(detailed))
         file.write(data_block("frames", {"ids": list(run.frame_ids), "detailed": detailed}))
         file.write(data_block("cars", {"columns": CAR_COLUMNS, "rows": [list(vars(row).values()) for row in rows]}))
         file.write(data_block("run", _run_facts(run, rows, grounds, notes)))
@@ -111,35 +85,23 @@ def make_report(
     return ReportOutcome(page, page.stat().st_size, len(run.frame_ids), len(detailed), len(rows), tuple(notes))
 
 
-def _known(run: RunFolder, reader: InputReader, frame_id: str) -> FrameMaterial:
-    """A frame without its images."""
-    result = run.read(frame_id)
-    lines = reader.detections(result)
-    detections = None if lines is None else [one for one in lines if one.type in run.classes and one.has_box_3d]
-    if detections is not None and len(detections) != len(result.cars):
-        raise DataFormatError(shapes_path(run.path, frame_id), "does not have the cars of its detection file")
-    return FrameMaterial(result, None, detections, reader.labels(frame_id))
-
-
-def _notes(
-    run: RunFolder, reader: InputReader, prior: ShapePrior | None, prior_was_given: bool, num_detailed: int
-) -> list[str]:
-    """What the page lacks because it was not given."""
-    dataset, notes = reader.dataset, _unfinished(run.path)
+def _notes(inputs: RunInputs, num_detailed: int) -> list[str]:
+    """What the page lacks because it was not given or could not be used."""
+    run, dataset, notes = inputs.run, inputs.dataset, _unfinished(inputs.run.path)
     if dataset is None:
         notes.append("no pictures and no residual maps: the images were not given (--data)")
-    if not reader.has_detections:
+    if dataset is None or not inputs.has_detections:
         notes.append("nothing from before the refinement: the detections were not given (--detections)")
     if dataset is not None and dataset.masks is None:
         notes.append("no residual maps: the masks were not given (--masks)")
-    if prior is None:
-        reason = "the prior is not that of the run" if prior_was_given else "the prior was not given"
-        notes.append(f"no residual maps, and no meshes but saved ones: {reason} (--prior)")
+    if inputs.prior is None:
+        notes.append("no residual maps, and no meshes but saved ones: the prior was not given (--prior)")
     if run.manifest.sha256["stereo_bias"] is not None and dataset is not None and not dataset.disparity_fields:
         notes.append("photometric residuals without the run's disparity field, so biased (--rig)")
     if num_detailed < len(run.frame_ids):
         notes.append(f"pictures and 3D views of {num_detailed} of {len(run.frame_ids)} frames (--max-frames)")
-    return notes
+    found = sorted(inputs.problems.items())
+    return notes + [f"{what} ({len(ids)} frame{'s' * (len(ids) != 1)})" for what, ids in found]
 
 
 def _unfinished(out_dir: Path) -> list[str]:

@@ -12,6 +12,7 @@ from helpers.finished_run import FRAMES, FinishedRun, by_place
 from numpy.typing import NDArray
 
 from directshape_torch.export.export_run import export_run
+from directshape_torch.export.frame_source import ExportOptions
 from directshape_torch.geometry.box3d import box_corners
 
 CARS_AND_PEDESTRIAN = 3
@@ -20,7 +21,7 @@ CARS_AND_PEDESTRIAN = 3
 @pytest.fixture(scope="module")
 def exported(finished: FinishedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("boxes")
-    export_run(finished.folder(), folder, ["kitti", "coco3d", "nuscenes"], finished.inputs())
+    export_run(finished.inputs(), folder, ["kitti", "coco3d", "nuscenes"], ExportOptions(finished.root))
     return folder
 
 
@@ -140,5 +141,5 @@ def test_nuscenes_heading_is_the_cars_own(finished: FinishedRun, exported: Path)
 
 
 def test_boxes_alone_need_no_images(finished: FinishedRun, exported: Path, tmp_path: Path) -> None:
-    export_run(finished.folder(), tmp_path, ["nuscenes", "kitti"], finished.inputs(with_images=False))
+    export_run(finished.inputs(with_images=False), tmp_path, ["nuscenes", "kitti"])
     assert (tmp_path / "nuscenes.json").read_bytes() == (exported / "nuscenes.json").read_bytes()

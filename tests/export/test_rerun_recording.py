@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import DataFormatError, MissingDependencyError
 from directshape_torch.export.export_run import export_run
+from directshape_torch.export.frame_source import ExportOptions
 from directshape_torch.export.painted_cars import SEEN, PaintedFrame
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.config_files import config_from_mapping
@@ -78,8 +79,7 @@ def refiner_of(run: FinishedRun) -> DirectShapeRefiner:
 @pytest.fixture(scope="module")
 def path(finished: FinishedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("rerun") / "sub" / "recording.rrd"
-    inputs = replace(finished.inputs(), has_detections=True, refiner=refiner_of(finished))
-    export_run(finished.folder(), path.parent, ["rerun"], inputs)
+    export_run(finished.inputs(), path.parent, ["rerun"], ExportOptions(refiner=refiner_of(finished)))
     assert [file.name for file in path.parent.iterdir()] == ["recording.rrd"]
     return path
 
@@ -238,7 +238,7 @@ def test_residuals_lie_on_their_cars_and_shrink(finished: FinishedRun, recording
 
 
 def test_without_a_refiner_there_are_frames_alone(finished: FinishedRun, tmp_path: Path) -> None:
-    export_run(finished.folder(), tmp_path, ["rerun"], finished.inputs())
+    export_run(finished.inputs(has_detections=False), tmp_path, ["rerun"])
     recording = Recording(tmp_path / "recording.rrd")
     assert {place[1] for places in recording.rows.values() for place in places} == {None}
     assert {place[0] for place in recording.of("/world/cam/image", "blob")} == {0, 1}
@@ -252,7 +252,7 @@ def test_a_car_moves_under_the_name_of_its_track(finished: FinishedRun, tmp_path
     for frame in ("000000", "000001"):
         path = tmp_path / "run" / "shapes" / f"{frame}.npz"
         write_shapes(path, replace(read_shapes(path), tracks=("000007", "")))
-    export_run(RunFolder(tmp_path / "run"), tmp_path, ["rerun"], finished.inputs())
+    export_run(finished.inputs(RunFolder(tmp_path / "run")), tmp_path, ["rerun"])
     recording = Recording(tmp_path / "recording.rrd")
     assert {place[0] for place in recording.of("/world/cars/track_000007", "vertex_positions")} == {0, 1}
 
@@ -262,7 +262,7 @@ def test_a_damaged_image_leaves_no_file(finished: FinishedRun, tmp_path: Path) -
     (root / "training" / "image_2" / "000001.png").write_bytes(b"no image")
     dataset = open_dataset("kitti", root, root / "detections", root / "masks")
     with pytest.raises(DataFormatError, match="000001"):
-        export_run(finished.folder(), tmp_path / "out", ["rerun"], replace(finished.inputs(), dataset=dataset))
+        export_run(replace(finished.inputs(), dataset=dataset), tmp_path / "out", ["rerun"])
     assert list((tmp_path / "out").iterdir()) == []
 
 
@@ -273,7 +273,7 @@ def test_an_end_that_fails_leaves_nothing_half_written(
     (tmp_path / "coco3d.json").mkdir()
     formats = ["rerun", "coco3d"] if recording_first else ["coco3d", "rerun"]
     with pytest.raises(OSError, match=r"coco3d\.json"):
-        export_run(RunFolder(finished.out, [0]), tmp_path, formats, finished.inputs())
+        export_run(finished.inputs(RunFolder(finished.out, [0])), tmp_path, formats)
     left = {path.name for path in tmp_path.iterdir()}
     assert left == ({"coco3d.json", "recording.rrd"} if recording_first else {"coco3d.json"})
 
@@ -283,4 +283,4 @@ def test_without_rerun_the_error_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'directshape_torch\[viewer\]'"):
-        export_run(finished.folder(), tmp_path, ["rerun"], finished.inputs())
+        export_run(finished.inputs(), tmp_path, ["rerun"])

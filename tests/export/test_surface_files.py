@@ -20,6 +20,7 @@ from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
 from directshape_torch.export.export_run import export_run
+from directshape_torch.export.frame_source import ExportOptions
 from directshape_torch.export.painted_cars import MIRRORED, NEUTRAL, NEUTRAL_RGB, SEEN
 from directshape_torch.io.frame_layout import FrameFiles
 from directshape_torch.io.result_files import read_shapes, write_shapes
@@ -32,7 +33,7 @@ LINES = (1, 3)
 @pytest.fixture(scope="module")
 def exported(finished: FinishedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("surfaces")
-    export_run(finished.folder(), folder, ["glb", "ply", "points"], finished.inputs(points_per_car=3000))
+    export_run(finished.inputs(), folder, ["glb", "ply", "points"], ExportOptions(points_per_car=3000))
     return folder
 
 
@@ -198,7 +199,7 @@ def test_a_car_moves_through_the_poses_of_its_track(
         motion = {"000000": (7.0, None), "000001": (7.0 + interval_s, None)}
         monkeypatch.setattr(FrameFiles, "read_motion", lambda files: motion[files.stems[0]])
     run = with_tracks(finished, tmp_path / "run", ("000007", ""), [(0, -1), (0, -1)])
-    export_run(run, tmp_path, ["glb"], finished.inputs())
+    export_run(finished.inputs(run), tmp_path, ["glb"])
     assert sorted(path.stem for path in (tmp_path / "glb").iterdir()) == ["000000", "000001", "track_000007"]
     file = glb(tmp_path / "glb" / "track_000007.glb")
     (animation,) = file.gltf.animations
@@ -227,7 +228,7 @@ def test_a_car_moves_through_the_poses_of_its_track(
 def test_what_shares_no_shape_does_not_move(finished: FinishedRun, tmp_path: Path) -> None:
     """Of a track that was split each part is a car, if it has two views; its name says which."""
     run = with_tracks(finished, tmp_path / "run", ("000007", "000008"), [(2, 0), (2, 1)])
-    export_run(run, tmp_path, ["glb"], finished.inputs())
+    export_run(finished.inputs(run), tmp_path, ["glb"])
     moving = [path.stem for path in (tmp_path / "glb").iterdir() if path.stem.startswith("track")]
     assert moving == ["track_000007_part2"]
 
@@ -271,7 +272,7 @@ def test_stereo_points_are_those_of_the_disparity_map(finished: FinishedRun, tmp
     """A map of constant disparity puts every point of a mask at the depth f b / d."""
     write_disparity(tmp_path / "maps" / "000000.png", np.full((120, 160), 10.0))
     maps = dataset(finished.root, frames=["000000"], disparity_dir=tmp_path / "maps")
-    export_run(RunFolder(finished.out, [0]), tmp_path, ["points"], replace(finished.inputs(), dataset=maps))
+    export_run(replace(finished.inputs(RunFolder(finished.out, [0])), dataset=maps), tmp_path, ["points"])
     path = tmp_path / "points" / "000000_1_stereo.ply"
     points = ply(path)
     # z_right = z + 0.004, so that the disparity is f 0.53 / z to first order.
@@ -285,7 +286,7 @@ def test_stereo_points_are_those_of_the_disparity_map(finished: FinishedRun, tmp
 
 
 def test_without_images_everything_is_grey(finished: FinishedRun, tmp_path: Path) -> None:
-    export_run(finished.folder(), tmp_path, ["glb", "ply", "points"], finished.inputs(with_images=False))
+    export_run(finished.inputs(with_images=False), tmp_path, ["glb", "ply", "points"])
     file = glb(tmp_path / "glb" / "000000.glb")
     assert set(file.nodes) == {"car_1", "car_3"}
     assert (file.attribute("car_1", "_COLOR_SOURCE") == NEUTRAL).all()
@@ -296,7 +297,7 @@ def test_without_images_everything_is_grey(finished: FinishedRun, tmp_path: Path
 
 
 def test_equal_runs_give_equal_bytes(finished: FinishedRun, exported: Path, tmp_path: Path) -> None:
-    export_run(finished.folder(), tmp_path, ["glb", "ply", "points"], finished.inputs(points_per_car=3000))
+    export_run(finished.inputs(), tmp_path, ["glb", "ply", "points"], ExportOptions(points_per_car=3000))
     names = sorted(path.relative_to(exported) for path in exported.rglob("*.*"))
     assert len(names) > 10
     for name in names:
@@ -309,8 +310,8 @@ def test_a_frame_without_refined_cars_has_no_surfaces(finished: FinishedRun, tmp
     path = out / "shapes" / "000000.npz"
     write_shapes(path, replace(read_shapes(path), statuses=("no_mask", "singular")))
     run = RunFolder(out, [0])
-    export_run(run, tmp_path / "images", ["glb", "ply", "points"], finished.inputs())
+    export_run(finished.inputs(run), tmp_path / "images", ["glb", "ply", "points"])
     assert set(glb(tmp_path / "images" / "glb" / "000000.glb").nodes) == {"ground"}
-    export_run(run, tmp_path / "plain", ["glb", "ply", "points"], finished.inputs(with_images=False))
+    export_run(finished.inputs(run, with_images=False), tmp_path / "plain", ["glb", "ply", "points"])
     assert glb(tmp_path / "plain" / "glb" / "000000.glb").nodes == {}
     assert not list(tmp_path.rglob("*.ply"))

@@ -25,7 +25,7 @@ T_CAM_OBJ = [pose_from_kitti(torch.tensor(place).double(), torch.tensor(yaw).dou
 
 def view(image: NDArray[np.uint8] | None = None) -> FrameView:
     cars = [EstimatedCar(PRIOR, torch.zeros(3).double(), T) for T in T_CAM_OBJ]
-    left = View(np.zeros((120, 160, 3), np.uint8) if image is None else image, K)
+    left = View(np.zeros((120, 160, 3), np.uint8) if image is None else image, np.column_stack([K, np.zeros(3)]))
     return FrameView(left, cars, [None] * len(cars))
 
 

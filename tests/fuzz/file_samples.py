@@ -42,6 +42,7 @@ from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.rig_file import load_field, load_rigs, save_field, save_rigs
 from directshape_torch.shape.load_prior import BUNDLED_PRIORS, load_prior
 from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
+from directshape_torch.visualize.run_frames import RunInputs
 
 ASSETS = Path(load_prior.__code__.co_filename).parents[1] / "assets"
 FRAME = FRAMES[0]
@@ -192,7 +193,7 @@ def _runs(root: Path, out: Path) -> dict[str, Sample]:
     refine(root, out, overlays=True)
 
     def report() -> object:
-        return make_report(RunFolder(out), out.parent / "page.html", prior=load_prior(root / "prior.npz"))
+        return make_report(RunInputs(RunFolder(out), load_prior(root / "prior.npz")), out.parent / "page.html")
 
     def resumed() -> object:
         return refine(root, out, overlays=True)

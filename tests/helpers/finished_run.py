@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
-from directshape_torch.export.frame_source import ExportInputs
 from directshape_torch.io.config_files import load_config
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.stereo_dataset import StereoDataset, open_dataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.visualize.run_frames import RunInputs
 from helpers.kitti_folder import write_data_set
 
 FRAMES = ("000000", "000001")
@@ -57,9 +57,12 @@ class FinishedRun:
         words = (self.root / f"training/calib/{frame_id}.txt").read_text().split("\n")[0].split()
         return np.array(words[1:], float).reshape(3, 4)
 
-    def inputs(self, with_images: bool = True, **options: Any) -> ExportInputs:
-        """What an export may use."""
-        return ExportInputs(self.prior, self.dataset if with_images else None, self.root, **options)
+    def inputs(
+        self, run: RunFolder | None = None, *, with_images: bool = True, has_detections: bool = True
+    ) -> RunInputs:
+        """What a page or an export may use, of all frames or of those of a folder."""
+        dataset = self.dataset if with_images else None
+        return RunInputs(self.folder() if run is None else run, self.prior, dataset, has_detections)
 
 
 def dataset_of(root: Path, classes: tuple[str, ...] = ("Car",)) -> StereoDataset:

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from helpers.finished_run import FinishedRun, refined, unpacked
 
-from directshape_torch.errors import DataFormatError
+from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.comparison import compare_results
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.report.make_report import ReportOutcome, make_report
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.visualize.run_frames import RunInputs
 
 
 def blocks(page: Path) -> dict[str, Any]:
@@ -28,9 +29,7 @@ def blocks(page: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def outcome(finished: FinishedRun, tmp_path_factory: pytest.TempPathFactory) -> ReportOutcome:
-    return make_report(
-        finished.folder(), tmp_path_factory.mktemp("page") / "page.html", finished.dataset, finished.prior
-    )
+    return make_report(finished.inputs(), tmp_path_factory.mktemp("page") / "page.html")
 
 
 @pytest.fixture(scope="module")
@@ -98,8 +97,8 @@ def test_meshes_stand_on_the_page_where_their_boxes_are(data: dict[str, Any]) ->
 
 
 def test_saved_meshes_stand_in_for_the_prior(finished: FinishedRun, tmp_path: Path) -> None:
-    with_prior = blocks(make_report(finished.folder(), tmp_path / "a.html", prior=finished.prior).path)["scene-0"]
-    outcome = make_report(finished.folder(), tmp_path / "b.html")
+    with_prior = blocks(make_report(finished.inputs(with_images=False), tmp_path / "a.html").path)["scene-0"]
+    outcome = make_report(RunInputs(finished.folder()), tmp_path / "b.html")
     saved = blocks(outcome.path)["scene-0"]
     assert any("no residual maps" in note for note in outcome.notes)
     for decoded_car, saved_car in zip(with_prior["cars"], saved["cars"], strict=True):
@@ -109,7 +108,7 @@ def test_saved_meshes_stand_in_for_the_prior(finished: FinishedRun, tmp_path: Pa
 
 
 def test_without_inputs_the_page_says_so(finished: FinishedRun, tmp_path: Path) -> None:
-    outcome = make_report(finished.folder(), tmp_path / "page.html", prior=finished.prior)
+    outcome = make_report(finished.inputs(with_images=False), tmp_path / "page.html")
     data = blocks(outcome.path)
     assert data["run"]["notes"] == list(outcome.notes)
     assert any("--data" in note for note in outcome.notes)
@@ -125,13 +124,11 @@ def test_a_changed_image_is_not_used(finished: FinishedRun, tmp_path: Path) -> N
     shutil.copy(root / "training/image_3/000000.png", root / "training/image_2/000000.png")
     (root / "training/image_2/000001.png").unlink()
     (root / "masks/000001.json").unlink()
-    outcome = make_report(
-        finished.folder(), tmp_path / "page.html", FinishedRun(root, finished.out).dataset, finished.prior
-    )
+    outcome = make_report(FinishedRun(root, finished.out).inputs(), tmp_path / "page.html")
     data = blocks(outcome.path)
     assert data["scene-0"]["image"] is None
-    assert "left image not used: the file has changed since the run (1 of 2 frames)" in outcome.notes
-    assert "left image not found (1 of 2 frames)" in outcome.notes
+    assert "left image not used: the file has changed since the run (1 frame)" in outcome.notes
+    assert "left image not found (1 frame)" in outcome.notes
 
 
 def test_detections_are_looked_for_in_all_frames_and_images_where_there_are_pictures(
@@ -142,21 +139,20 @@ def test_detections_are_looked_for_in_all_frames_and_images_where_there_are_pict
         (root / "training" / "image_2" / f"{name}.png").unlink()
         path = root / "detections" / "data" / f"{name}.txt"
         path.write_text(path.read_text() + "\n")
-    dataset = FinishedRun(root, finished.out).dataset
-    outcome = make_report(finished.folder(), tmp_path / "page.html", dataset, finished.prior, most_frames=1)
-    assert "left image not found (1 of 1 frames)" in outcome.notes
+    inputs = FinishedRun(root, finished.out).inputs()
+    outcome = make_report(inputs, tmp_path / "page.html", most_frames=1)
+    assert "left image not found (1 frame)" in outcome.notes
     of_detections = [note for note in outcome.notes if note.startswith("detections")]
-    assert of_detections == ["detections not used: the file has changed since the run (2 of 2 frames)"]
+    assert of_detections == ["detections not used: the file has changed since the run (2 frames)"]
 
 
-def test_another_prior_is_not_used(finished: FinishedRun, tmp_path: Path) -> None:
-    outcome = make_report(finished.folder(), tmp_path / "page.html", finished.dataset, PCAShapePrior.load_bundled())
-    assert any("the prior is not that of the run" in note for note in outcome.notes)
-    assert "mean-mesh" not in blocks(outcome.path)
+def test_another_prior_is_refused(finished: FinishedRun) -> None:
+    with pytest.raises(InputError, match="that of the run"):
+        RunInputs(finished.folder(), PCAShapePrior.load_bundled(), finished.dataset)
 
 
 def test_few_frames_have_details(finished: FinishedRun, tmp_path: Path) -> None:
-    outcome = make_report(finished.folder(), tmp_path / "page.html", finished.dataset, finished.prior, most_frames=1)
+    outcome = make_report(finished.inputs(), tmp_path / "page.html", most_frames=1)
     data = blocks(outcome.path)
     assert len(data["frames"]["detailed"]) == 1
     assert len(data["cars"]["rows"]) == 4
@@ -171,7 +167,7 @@ def test_failed_frames_and_frames_without_cars(finished: FinishedRun, tmp_path: 
     (data_set / "training/image_3/000000.png").write_bytes(b"no image")
     (data_set / "detections/data/000001.txt").write_text("")
     again = refined(data_set, folder / "out")
-    data = blocks(make_report(again.folder(), tmp_path / "page.html", again.dataset, again.prior).path)
+    data = blocks(make_report(again.inputs(), tmp_path / "page.html").path)
     assert list(data["run"]["failed"]) == ["000000"]
     assert data["frames"]["ids"] == ["000001"]
     assert data["cars"]["rows"] == []
@@ -185,13 +181,12 @@ def test_a_run_that_was_cut_off(finished: FinishedRun, tmp_path: Path) -> None:
     (out / "run.jsonl").write_text("".join(log[:-2]))
     text = (out / "data" / "000001.txt").read_bytes()
     (out / "data" / "000001.txt").unlink()
-    assert blocks(make_report(RunFolder(out), tmp_path / "a.html", finished.dataset, finished.prior).path)["frames"][
-        "ids"
-    ] == ["000000"]
+    cut_off = make_report(finished.inputs(RunFolder(out)), tmp_path / "a.html")
+    assert blocks(cut_off.path)["frames"]["ids"] == ["000000"]
     (out / "data" / "000001.txt").write_bytes(text)
     summary = json.loads((out / "summary.json").read_text())
     (out / "summary.json").write_text(json.dumps({**summary, "frames": {}}))
-    outcome = make_report(RunFolder(out), tmp_path / "b.html", finished.dataset, finished.prior)
+    outcome = make_report(finished.inputs(RunFolder(out)), tmp_path / "b.html")
     assert blocks(outcome.path)["frames"]["ids"] == ["000000", "000001"]
     assert blocks(outcome.path)["run"]["ground_sources"] == {"file": 2}
     (note,) = outcome.notes
@@ -199,7 +194,7 @@ def test_a_run_that_was_cut_off(finished: FinishedRun, tmp_path: Path) -> None:
 
 
 def test_equal_runs_give_equal_pages(finished: FinishedRun, outcome: ReportOutcome, tmp_path: Path) -> None:
-    again = make_report(finished.folder(), tmp_path / "again.html", finished.dataset, finished.prior)
+    again = make_report(finished.inputs(), tmp_path / "again.html")
     assert again.path.read_bytes() == outcome.path.read_bytes()
 
 
@@ -209,6 +204,6 @@ def test_a_damaged_frame_leaves_the_old_page(finished: FinishedRun, tmp_path: Pa
     page.write_text("old")
     (out / "shapes" / "000001.npz").write_bytes(b"PK")
     with pytest.raises(DataFormatError, match="000001"):
-        make_report(RunFolder(out), page, finished.dataset, finished.prior)
+        make_report(finished.inputs(RunFolder(out)), page)
     assert page.read_text() == "old"
     assert [path.name for path in tmp_path.iterdir() if path.name.endswith(".tmp")] == []

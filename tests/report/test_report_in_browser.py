@@ -49,7 +49,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
         made_of = replace(read_record(path, shapes), run=manifest.hash).text()
         write_shapes(path, replace(shapes, tracks=(TRACK, ""), track_parts=np.array([part, -1]), made_of=made_of))
     write_png(run.out / RIG_PICTURE, np.zeros((40, 3000, 3), np.uint8))
-    return make_report(run.folder(), run.out.parent / "a page#1.html", run.dataset, run.prior).path
+    return make_report(run.inputs(), run.out.parent / "a page#1.html").path
 
 
 @pytest.fixture(scope="module")

@@ -139,17 +139,13 @@ def test_curves_fall_where_their_values_fall() -> None:
     assert left < rows[columns > 340].mean() - 100
 
 
-FIELD_SIZE = (200, 80)
-TITLE_PX, GAP_PX = 30, 6
-
-
 @pytest.mark.parametrize(("value_px", "strong", "weak"), [(-0.4, 2, 0), (0.4, 0, 2)])
 def test_negative_is_blue_and_positive_red(value_px: float, strong: int, weak: int) -> None:
-    field = DisparityField.constant(value_px, FIELD_SIZE, torch.eye(3), torch.eye(3), torch.eye(4))
-    picture = draw_disparity_field(field, torch.tensor([[100.0, 40.0]]), torch.tensor([value_px]))
-    panel_px = TITLE_PX + FIELD_SIZE[1] + GAP_PX
-    assert picture.shape == (3 * panel_px, FIELD_SIZE[0], 3)
-    field_pixel, before, after = (picture[n * panel_px + TITLE_PX + 40, 100].astype(int) for n in range(3))
-    assert field_pixel[strong] > field_pixel[weak] + 80
-    assert before[strong] > before[weak] + 80
-    assert after.min() > 240
+    """Also in the dots: one that agrees has the colour of the field around it, one that does not the opposite."""
+    field = DisparityField.constant(value_px, (200, 80), torch.eye(3), torch.eye(3), torch.eye(4))
+    at = torch.tensor([[50.0, 40.0], [150.0, 40.0]])
+    panel = draw_disparity_field(field, at, torch.tensor([value_px, -value_px]))[-80:].astype(int)
+    assert panel.shape == (80, 200, 3)
+    for place in (panel[40, 100], panel[40, 50]):
+        assert place[strong] > place[weak] + 80
+    assert panel[40, 150][weak] > panel[40, 150][strong] + 80

@@ -1,0 +1,160 @@
+"""The frames of a run with what went into them, as far as it is at hand and has not changed since."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.run_folder import FrameResult, RunFolder, shapes_path
+from directshape_torch.io.run_manifest import hash_file, hash_prior
+from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.visualize.drawing import Array, Surface
+from directshape_torch.visualize.drawn_car import (
+    DrawnCar,
+    cars_after,
+    cars_before,
+    corners_cam,
+    mean_car,
+    true_corners,
+)
+
+_WORDS = {"image_left": "left image", "image_right": "right image", "ground_plane": "ground plane"}
+
+
+@dataclass(frozen=True)
+class RunInputs:
+    """A run and what else a page or an export may use.
+
+    Raises:
+        InputError: the prior is not that of the run.
+    """
+
+    run: RunFolder
+    prior: ShapePrior | None = None  # the shapes of the run; None: saved meshes or none
+    # Images, calibrations, masks and detections of the run's frames; None: no pictures and no colours.
+    dataset: StereoDataset | None = None
+    has_detections: bool = True  # whether the detections of that data set are those of the run, or others stand in
+    # What could not be used, and of which frames.
+    problems: dict[str, set[str]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.prior is not None and hash_prior(self.prior) != self.run.manifest.sha256["prior"]:
+            raise InputError("prior", "that of the run", "another one", "name that of the run with --prior")
+
+    @cached_property
+    def mean(self) -> Surface | None:
+        """The mean shape in its object frame."""
+        return None if self.prior is None else mean_car(self.prior)
+
+
+class RunFrame:
+    """One finished frame of a run; its parts are read when they are first asked for.
+
+    Raises:
+        DataFormatError: a file of the run is missing or damaged.
+    """
+
+    def __init__(self, inputs: RunInputs, frame_id: str) -> None:
+        self.inputs, self.frame_id = inputs, frame_id
+
+    @cached_property
+    def result(self) -> FrameResult:
+        """Boxes, states and shapes."""
+        return self.inputs.run.read(self.frame_id)
+
+    @cached_property
+    def detections(self) -> list[KittiObject] | None:
+        """The lines of its cars in the detection file."""
+        dataset = self.inputs.dataset
+        if dataset is None or not self.inputs.has_detections:
+            return None
+        if not self._are_unchanged({"detections": dataset.layout.files(self.frame_id).detections}):
+            return None
+        run, lines = self.inputs.run, dataset.objects(self.frame_id)
+        cars = [one for one in lines if one.type in run.classes and one.has_box_3d]
+        if len(cars) != len(self.result.cars):
+            raise DataFormatError(shapes_path(run.path, self.frame_id), "does not have the cars of its detection file")
+        return cars
+
+    @property
+    def labels(self) -> list[KittiObject] | None:
+        """The ground truth, which no run reads and so no hash can tell."""
+        dataset = self.inputs.dataset
+        return None if dataset is None else dataset.layout.files(self.frame_id).read_labels()
+
+    @cached_property
+    def loaded(self) -> LoadedFrame | None:
+        """Images, camera, ground and masks, if they are those that went in."""
+        dataset = self.inputs.dataset
+        if dataset is None:
+            return None
+        try:
+            files = dataset.input_files(self.frame_id)
+        except DataFormatError as error:
+            # The list of a frame's masks is itself a file.
+            self._note(f"{error.path.name} not found or damaged")
+            found = dataset.layout.files(self.frame_id)
+            self._are_unchanged({"image_left": found.left, "image_right": found.right})
+            return None
+        # Of `detections` what stands in cannot be the same.
+        kept = {role: path for role, path in files.items() if role != "detections" or self.inputs.has_detections}
+        return dataset.load(self.frame_id) if self._are_unchanged(kept) else None
+
+    @cached_property
+    def t_cam_ref(self) -> Tensor:
+        """`x_cam = x_ref + t_cam_ref` (3,), float64, from the states themselves; zero for a frame without cars."""
+        shapes = self.result.shapes
+        if not len(shapes.input_lines):
+            return torch.zeros(3, dtype=torch.float64)
+        offset = shapes.T_cam_obj.astype(np.float64)[:, :3, 3] - shapes.T_ref_obj.astype(np.float64)[:, :3, 3]
+        return torch.from_numpy(np.median(offset, axis=0))
+
+    @cached_property
+    def before(self) -> list[DrawnCar] | None:
+        """Its cars as they went in."""
+        if self.detections is None:
+            return None
+        return cars_before(self.detections, self.t_cam_ref, self.inputs.mean, self.result.shapes.codes.shape[1])
+
+    @cached_property
+    def after(self) -> list[DrawnCar]:
+        """Its cars as the run left them."""
+        shapes = self.result.shapes
+        location_ref, rotation_y, hwl = (
+            torch.from_numpy(x) for x in (shapes.boxes_location_ref, shapes.boxes_rotation_y, shapes.boxes_hwl)
+        )
+        corners = corners_cam(location_ref, rotation_y, hwl, self.t_cam_ref)
+        states = (shapes.input_lines.tolist(), shapes.statuses, shapes.T_cam_obj, shapes.codes, corners)
+        return cars_after(*states, self.before, self.inputs.prior, self.result.mesh_files)
+
+    @property
+    def truth_corners_cam(self) -> list[Array]:
+        """Corners (8, 3) of the labelled boxes of the refined classes."""
+        return true_corners(self.labels, self.inputs.run.classes, self.t_cam_ref)
+
+    def _are_unchanged(self, files: Mapping[str, Path]) -> bool:
+        """Whether the files are those that the run read."""
+        found = [self._problem(role, path) for role, path in files.items()]
+        for problem in filter(None, found):
+            self._note(problem)
+        return not any(found)
+
+    def _problem(self, role: str, path: Path) -> str | None:
+        name, known = _WORDS.get(role, role), self.result.record.inputs.get(role)
+        if role.startswith("masks_"):
+            name = "masks"
+        if not path.is_file():
+            return f"{name} not found"
+        return f"{name} not used: the file has changed since the run" if known not in (None, hash_file(path)) else None
+
+    def _note(self, problem: str) -> None:
+        self.inputs.problems.setdefault(problem, set()).add(self.frame_id)
