@@ -36,7 +36,7 @@ CASES = [
     ("report {root} --html {out}/page.html", "summary.json"),
     ("status {root}", "no run of 'directshape refine' is or was here"),
     (INSPECT, "something to inspect"),
-    (f"{INSPECT} --demo --frame 7", "000007"),
+    (f"{INSPECT} --demo --frame 7", "such as 000000, got 7"),
     (f"{INSPECT} --demo --car 9", "car of frame 000000: 1, 2, 3, 4, 5, 6, got 9"),
     (f"{INSPECT} --demo --data x", "bundled frame alone"),
     (f"{INSPECT} --data {DEMO_FOLDER}", "give --frame ID"),
@@ -55,7 +55,7 @@ CASES = [
     (f"{MASKED} --lidar nowhere", "nowhere: is no folder of LiDAR scans"),
     (f"{MASKED} --disparity x", "--disparity: expected a method that uses it, got direct; add --method"),
     (f"{MASKED} --method geometric --disparity nowhere", "is no folder of disparity maps"),
-    ("check-data --data {root} --detections {root}/detections --masks {root}/masks --frames 77", "000077"),
+    ("check-data --data {root} --detections {root}/detections --masks {root}/masks --frames 77", "such as 000000, got 77"),
     ("evaluate --labels {root}/training/label_2 --results {root}/training/label_2", "a result without score"),
 ]
 
