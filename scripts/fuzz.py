@@ -22,8 +22,7 @@ TESTS = Path(__file__).resolve().parent.parent / "tests"
 sys.path[:0] = [str(TESTS / "fuzz"), str(TESTS), str(TESTS.parent)]
 
 from command_line import run_command  # noqa: E402
-from fuzzing.cases import serve  # noqa: E402
-from fuzzing.children import OUTCOMES, tally  # noqa: E402
+from fuzzing.cases import tally  # noqa: E402
 from fuzzing.faults import inject_faults  # noqa: E402
 from fuzzing.kills import kill_runs  # noqa: E402
 
@@ -37,17 +36,13 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: a number below 0.
     """
-    if args.serve:
-        serve(args.serve)
-        return 0
     for name in ("calls", "files", "kills", "faults"):
         if getattr(args, name) < 0:
             raise InputError(f"--{name}", "at least 0", f"{getattr(args, name)}")
     figures: dict[str, dict[str, object]] = {}
     for kind in ("calls", "files"):
         if count := getattr(args, kind):
-            found = tally(kind, iter(range(args.seed, args.seed + count)), args.timeout, _say)
-            figures[kind] = {**{name: found.counts[name] for name in OUTCOMES}, "found": found.found}
+            figures[kind] = tally(kind, range(args.seed, args.seed + count), args.timeout, _say)
     if args.kills:
         figures["kills"] = kill_runs(args.kills, args.seed, args.timeout, _say)
     if args.faults:
@@ -88,7 +83,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--timeout", type=float, default=120.0, metavar="S", help="of a case, and for a killed run to end"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="for fuzz.json and fuzz.txt")
-    parser.add_argument("--serve", choices=("calls", "files"), help=argparse.SUPPRESS)
     return run_command(parser, run, arguments)
 
 

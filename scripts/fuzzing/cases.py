@@ -1,49 +1,37 @@
-"""One case after the other in this process, as `children` asks for them: a seed in, a line of JSON out."""
+"""Odd calls and damaged files, in child processes: what crashes, hangs or eats memory ends with its child alone."""
 
 from __future__ import annotations
 
-import json
+import multiprocessing
 import os
 import random
 import resource
-import shutil
-import sys
 import tempfile
 import traceback
 import warnings
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from directshape_torch.errors import DirectShapeError
 
+OUTCOMES = ("accepted", "refused", "foreign exception", "silent NaN", "crash", "hang", "over memory")
 # Above what the process has mapped before its first case.
 BUDGET_BYTES = 2**31
 _NO_MEMORY = ("allocate memory", "not enough memory", "insufficient memory", "cannot allocate")
+# A child reads its samples first.
+_PATIENCE_AT_START_S = 1800.0
 
 Case = Callable[[random.Random], tuple[str, Callable[[], bool]]]
 """Draws one case: its name, and what does it and says whether all is finite that must be."""
 
 
-def serve(kind: str) -> None:
-    """Answer seeds on stdin until it ends."""
-    torch.set_num_threads(1)
-    warnings.simplefilter("ignore")
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", buffering=1)
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    folder = Path(tempfile.mkdtemp(prefix="fuzz"))
-    try:
-        case = _odd_calls() if kind == "calls" else _damaged_files(folder)
-        _limit_memory()
-        answers.write("ready\n")
-        for line in sys.stdin:
-            answers.write(json.dumps(answer(case, int(line))) + "\n")
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def answer(case: Case, seed: int) -> dict[str, object]:
+def answer(case: Case, seed: int) -> dict[str, Any]:
     """How a case ended, and where it was raised what should not have been."""
     name, act = case(random.Random(seed))
     outcome, said = "accepted", ""
@@ -55,6 +43,22 @@ def answer(case: Case, seed: int) -> dict[str, object]:
         is_memory = isinstance(error, MemoryError) or any(word in str(error).lower() for word in _NO_MEMORY)
         outcome, said = "over memory" if is_memory else "foreign exception", _where(error)
     return {"seed": seed, "name": name, "outcome": outcome, "said": said}
+
+
+def serve(kind: str, pipe: Connection) -> None:
+    """The life of a child: answers seeds until the pipe ends."""
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore")
+    for stream in (1, 2):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+    with tempfile.TemporaryDirectory(prefix="fuzz") as folder, suppress(EOFError):
+        case = _odd_calls() if kind == "calls" else _damaged_files(Path(folder))
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        limit = pages * resource.getpagesize() + BUDGET_BYTES
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+        pipe.send("ready")
+        while True:
+            pipe.send(answer(case, pipe.recv()))
 
 
 def _odd_calls() -> Case:
@@ -98,14 +102,57 @@ def _damaged_files(folder: Path) -> Case:
     return case
 
 
-def _limit_memory() -> None:
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    limit = pages * resource.getpagesize() + BUDGET_BYTES
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-
-
 def _where(error: Exception) -> str:
     """The error and the last place of the package on its way."""
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if "/directshape_torch/" in frame.filename]
     place = f" at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
     return f"{type(error).__name__}{place}: {str(error)[:200]}"
+
+
+class _Child:
+    """A process that answers seeds."""
+
+    def __init__(self, kind: str) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=serve, args=(kind, theirs), daemon=True)
+        self._process.start()
+        theirs.close()
+        if not self._pipe.poll(_PATIENCE_AT_START_S):
+            raise RuntimeError("a child did not start")
+        self._pipe.recv()
+
+    def ask(self, seed: int, timeout_s: float) -> dict[str, Any]:
+        """Its answer, or that there was none; then it has ended."""
+        outcome, said = "hang", f"{timeout_s:g} s"
+        try:
+            self._pipe.send(seed)
+            if self._pipe.poll(timeout_s):
+                found: dict[str, Any] = self._pipe.recv()
+                return found
+        except (EOFError, ConnectionError):
+            self._process.join()
+            outcome, said = "crash", f"exit code {self._process.exitcode}"
+        self.end()
+        return {"seed": seed, "name": "", "outcome": outcome, "said": said}
+
+    def end(self) -> None:
+        self._process.kill()
+        self._process.join()
+
+
+def tally(kind: str, seeds: Iterable[int], timeout_s: float, report: Callable[[str], None]) -> dict[str, Any]:
+    """How many cases of these seeds ended how, and what was `found`: those that ended as none should."""
+    child, counts, found = _Child(kind), Counter[str](), []
+    for number, seed in enumerate(seeds, start=1):
+        said = child.ask(seed, timeout_s)
+        counts[said["outcome"]] += 1
+        if said["outcome"] not in ("accepted", "refused"):
+            found.append(said)
+            report(f"{kind} {seed}: {said['outcome']}: {said['name']}: {said['said']}")
+        if said["outcome"] in ("crash", "hang"):
+            child = _Child(kind)
+        if number % 1000 == 0:
+            report(f"{kind}: {number}: {dict(counts)}")
+    child.end()
+    return {**{name: counts[name] for name in OUTCOMES}, "found": found}

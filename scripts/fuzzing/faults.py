@@ -6,23 +6,18 @@ import builtins
 import errno
 import os
 import shutil
-import tempfile
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 from unittest import mock
 
-from helpers.faulty_refiners import QuickRefiner
-from helpers.kitti_folder import write_data_set
 from helpers.output_folders import result_files
-from helpers.quick_runs import dataset
 
-from directshape_torch.batch.options import RefineOptions, RunObserver
-from directshape_torch.batch.refine_dataset import refine_dataset
+from directshape_torch.batch.options import RunObserver
 from directshape_torch.batch.run_log import log_path, read_log
 from directshape_torch.errors import DirectShapeError
+from fuzzing.runs import DisturbedRuns, disturbed_runs
 
 FRAMES = ("000000", "000001", "000002")
 ERRORS = (errno.ENOSPC, errno.EIO)
@@ -120,82 +115,45 @@ TAKEN: dict[str, Callable[[Path], None]] = {
 
 def inject_faults(every: int, report: Callable[[str], None]) -> dict[str, Any]:
     """Let every `every`-th operation fail by itself; how the runs ended, and those that ended as none should."""
-    folder = Path(tempfile.mkdtemp(prefix="faults"))
-    counts: Counter[str] = Counter()
-    found: list[dict[str, Any]] = []
-    try:
-        root = folder / "kitti"
-        write_data_set(root, FRAMES)
-        disk = _FaultyDisk(folder / "undisturbed", None, 0)
+    with disturbed_runs(FRAMES, report) as runs:
+        disk = _FaultyDisk(runs.out, None, 0)
         with disk.inserted():
-            _run(root, folder / "undisturbed")
-        expected, out = result_files(folder / "undisturbed"), folder / "out"
+            runs.run()
+        shutil.rmtree(runs.out)
         report(f"faults: {disk.count} writes and renames in a run of {len(FRAMES)} frames")
         for number in range(0, disk.count, every):
             for error in ERRORS:
-                name = f"{errno.errorcode[error]} at operation {number}"
-                with _FaultyDisk(out, number, error).inserted():
-                    ended = _ended(root, out)
-                _judge(name, ended, root, out, expected, counts, found)
+                with _FaultyDisk(runs.out, number, error).inserted():
+                    ended = _ended(runs)
+                _judge(runs, f"{errno.errorcode[error]} at operation {number}", ended)
         for name, take in TAKEN.items():
-            _judge(name, _ended(root, out, _Taker(out, take)), root, out, expected, counts, found)
-        for each in found:
-            report(f"fault: {each['name']}: {each['said']}")
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-    return {
-        **dict(sorted(counts.items())),
-        "runs that did not go on to the same bytes": len(found),
-        "found": found,
-    }
+            _judge(runs, name, _ended(runs, _Taker(runs.out, take)))
+        return runs.figures
 
 
-def _judge(
-    name: str,
-    ended: str,
-    root: Path,
-    out: Path,
-    expected: dict[str, bytes],
-    counts: Counter[str],
-    found: list[dict[str, Any]],
-) -> None:
+def _judge(runs: DisturbedRuns, name: str, ended: str) -> None:
     """Whether the run told of its trouble, left nothing that lies, and the next one repairs it."""
-    counts[ended.partition(":")[0]] += 1
     trouble = None
     if ended.startswith("foreign"):
         trouble = ended
-    elif ended == "success" and result_files(out) != expected:
+    elif ended == "success" and result_files(runs.out) != runs.expected:
         trouble = "success, with other files than those of an undisturbed run"
-    if out.is_dir():
-        if log_path(out).exists():
-            read_log(out)
-        if list(out.rglob("*.tmp")):
+    if runs.out.is_dir():
+        read_log(runs.out)
+        if list(runs.out.rglob("*.tmp")):
             trouble = "a temporary file stays"
     # What stands in the place of a folder is for the user to remove.
-    for path in (out, out / "data"):
+    for path in (runs.out, runs.out / "data"):
         if path.is_file():
             path.unlink()
-    try:
-        code = _run(root, out).exit_code
-        if code != 0 or result_files(out) != expected:
-            trouble = trouble or f"the next run ends with exit code {code} or other files"
-    except Exception as error:
-        trouble = f"the next run raises {error!r}"
-    if trouble is not None:
-        found.append({"name": name, "said": trouble})
-    shutil.rmtree(out, ignore_errors=True)
+    runs.judge(name, ended.partition(":")[0], trouble)
 
 
-def _ended(root: Path, out: Path, observer: RunObserver | None = None) -> str:
+def _ended(runs: DisturbedRuns, observer: RunObserver | None = None) -> str:
     """How a run ended: "success", "told by its exit code", "told by an error", "foreign exception"."""
     try:
-        code = _run(root, out, observer).exit_code
+        return "told by its exit code" if runs.run(observer) else "success"
     except (DirectShapeError, OSError) as error:
         return f"told by an error: {error}"
     except Exception as error:
         return f"foreign exception: {error!r}"
-    return "told by its exit code" if code else "success"
-
-
-def _run(root: Path, out: Path, observer: RunObserver | None = None) -> Any:
-    return refine_dataset(dataset(root), QuickRefiner(root), out, RefineOptions(threads=1), observer)

@@ -8,21 +8,13 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
-from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from helpers.faulty_refiners import QuickRefiner
-from helpers.kitti_folder import write_data_set
-from helpers.output_folders import result_files
-from helpers.quick_runs import dataset
-
-from directshape_torch.batch.options import RefineOptions
-from directshape_torch.batch.refine_dataset import refine_dataset
+from fuzzing.runs import DisturbedRuns, disturbed_runs
 
 FRAMES = tuple(f"{number:06d}" for number in range(6))
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
@@ -31,35 +23,21 @@ _SLOW_RUN = Path(__file__).parents[2] / "tests" / "helpers" / "slow_run.py"
 
 def kill_runs(count: int, seed: int, patience_s: float, report: Callable[[str], None]) -> dict[str, Any]:
     """End `count` runs; how many of what, and those after which the next run did not end as an undisturbed one."""
-    folder = Path(tempfile.mkdtemp(prefix="kills"))
-    counts: Counter[str] = Counter()
-    found: list[dict[str, Any]] = []
-    try:
-        root = folder / "kitti"
-        write_data_set(root, FRAMES)
-        _resume(root, folder / "undisturbed")
-        expected = result_files(folder / "undisturbed")
-        whole_s = _length_of_a_run(root, folder / "timed", patience_s)
-        for number in range(count):
-            chance, out = random.Random(seed + number), folder / "out"
-            name, trouble = _one(root, out, expected, chance, whole_s, patience_s)
-            counts[name] += 1
-            if trouble:
-                found.append({"seed": seed + number, "name": name, "said": trouble})
-            report(f"kill {seed + number}: {name}: {trouble or 'resumed to the same bytes'}")
-            shutil.rmtree(out, ignore_errors=True)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-    return {**dict(sorted(counts.items())), "runs that did not go on to the same bytes": len(found), "found": found}
+    with disturbed_runs(FRAMES, report) as runs:
+        start = time.monotonic()
+        assert _started(runs).wait(patience_s) == 0, "a run that nobody disturbs fails"
+        whole_s = time.monotonic() - start
+        shutil.rmtree(runs.out)
+        for number in range(seed, seed + count):
+            kind, trouble = _ended_run(runs, random.Random(number), whole_s, patience_s)
+            runs.judge(f"kill {number}: {kind}", kind, trouble)
+        return runs.figures
 
 
-def _one(
-    root: Path, out: Path, expected: dict[str, bytes], chance: random.Random, whole_s: float, patience_s: float
-) -> tuple[str, str | None]:
+def _ended_run(runs: DisturbedRuns, chance: random.Random, whole_s: float, patience_s: float) -> tuple[str, str | None]:
     """Who was ended by what, and what went wrong."""
     by, whom = chance.choice(SIGNALS), chance.choice(("parent", "parent", "worker"))
-    run = _started(root, out)
-    trouble: str | None = None
+    run = _started(runs)
     try:
         time.sleep(chance.uniform(0.0, whole_s))
         workers = _children(run.pid)
@@ -74,33 +52,20 @@ def _one(
             code = run.wait(patience_s)
         except subprocess.TimeoutExpired:
             return name, "the run did not end"
-        if _outlive(workers, patience_s):
-            trouble = "workers outlive their parent"
         if whom == "worker" and name != "nobody, it had ended" and code != 0:
-            trouble = f"a worker's death ended the run with exit code {code}"
+            return name, f"a worker's death ended the run with exit code {code}"
+        return name, "workers outlive their parent" if _outlive(workers, patience_s) else None
     finally:
         with suppress(ProcessLookupError):
             os.killpg(run.pid, signal.SIGKILL)
         run.wait()
-    summary = _resume(root, out)
-    if summary.exit_code != 0:
-        trouble = f"the next run failed: {summary.failed}"
-    elif result_files(out) != expected:
-        trouble = "other files than those of an undisturbed run"
-    return name, trouble
 
 
-def _started(root: Path, out: Path) -> subprocess.Popen[bytes]:
+def _started(runs: DisturbedRuns) -> subprocess.Popen[bytes]:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(_SLOW_RUN), str(root), str(out)]
+    command = [sys.executable, str(_SLOW_RUN), str(runs.root), str(runs.out)]
     nowhere = subprocess.DEVNULL
     return subprocess.Popen(command, env=environment, stdout=nowhere, stderr=nowhere, start_new_session=True)
-
-
-def _length_of_a_run(root: Path, out: Path, patience_s: float) -> float:
-    start = time.monotonic()
-    assert _started(root, out).wait(patience_s) == 0, "a run that nobody disturbs fails"
-    return time.monotonic() - start
 
 
 def _children(pid: int) -> list[int]:
@@ -119,7 +84,3 @@ def _outlive(workers: list[int], patience_s: float) -> bool:
             return True
         time.sleep(0.05)
     return False
-
-
-def _resume(root: Path, out: Path) -> Any:
-    return refine_dataset(dataset(root), QuickRefiner(root), out, RefineOptions(threads=1))

@@ -55,7 +55,10 @@ CASES = [
     (f"{MASKED} --lidar nowhere", "nowhere: is no folder of LiDAR scans"),
     (f"{MASKED} --disparity x", "--disparity: expected a method that uses it, got direct; add --method"),
     (f"{MASKED} --method geometric --disparity nowhere", "is no folder of disparity maps"),
-    ("check-data --data {root} --detections {root}/detections --masks {root}/masks --frames 77", "such as 000000, got 77"),
+    (
+        "check-data --data {root} --detections {root}/detections --masks {root}/masks --frames 77",
+        "such as 000000, got 77",
+    ),
     ("evaluate --labels {root}/training/label_2 --results {root}/training/label_2", "a result without score"),
 ]
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
+import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import fuzz
 import pytest
 from fuzzing import cases
-from fuzzing.children import Tally, tally
 
 from directshape_torch.errors import InputError
 
@@ -46,16 +48,25 @@ def test_what_a_case_ends_with(error: Exception | None, outcome: str) -> None:
     assert cases.answer(lambda _: ("name", lambda: False), 7)["outcome"] == "silent NaN"
 
 
-@pytest.mark.parametrize(("code", "outcome"), [("import time; time.sleep(60)", "hang"), ("os._exit(9)", "crash")])
+def hangs(_: str, pipe: Connection) -> None:
+    pipe.send("ready")
+    pipe.recv()
+    time.sleep(60)
+
+
+def crashes(_: str, pipe: Connection) -> None:
+    pipe.send("ready")
+    pipe.recv()
+    os._exit(9)
+
+
+@pytest.mark.parametrize(("child", "outcome"), [(hangs, "hang"), (crashes, "crash")])
 def test_children_that_hang_or_crash_are_counted_and_replaced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, outcome: str
+    monkeypatch: pytest.MonkeyPatch, child: object, outcome: str
 ) -> None:
-    script = tmp_path / "child.py"
-    script.write_text(f"import os, sys\nprint('ready', flush=True)\nsys.stdin.readline()\n{code}\n")
-    monkeypatch.setattr("fuzzing.children._SCRIPT", script)
-    found = tally("calls", iter((4, 5)), 0.5, lambda _: None)
-    assert (dict(found.counts), [each["seed"] for each in found.found]) == ({outcome: 2}, [4, 5])
-    assert Tally().found == []
+    monkeypatch.setattr(cases, "serve", child)
+    figures = cases.tally("calls", (4, 5), 0.5, lambda _: None)
+    assert (figures[outcome], [each["seed"] for each in figures["found"]]) == (2, [4, 5])
 
 
 def test_wrong_use() -> None:
