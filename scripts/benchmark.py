@@ -5,7 +5,7 @@
     python scripts/benchmark.py --against ../other_checkout      # times and operations of this version over another's
 
 Frames come from DIRECTSHAPE_DATA (or --data), else from the bundled demo frame. A graphics card is taken where there is
-one; then it is also told how often it agrees with the CPU, and waits.
+one; then it is also told how often it agrees with the CPU.
 """
 
 from __future__ import annotations

@@ -1,18 +1,15 @@
-"""What is counted of one call, rather than timed: operations, memory of tensors, waits for a graphics card."""
+"""What is counted of one call, rather than timed: operations, memory of tensors."""
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 _MEMORY_EVENT = "[memory]"
-_WAIT_WARNING = "synchronizing CUDA operation"
 
 
 class OperationCount(TorchDispatchMode):  # type: ignore[no-untyped-call]
@@ -83,22 +80,3 @@ def peak_tensor_bytes(call: Callable[[], object], device: torch.device | None = 
         living += event.nbytes()
         peak = max(peak, living)
     return peak
-
-
-def count_synchronisations(call: Callable[[], object]) -> Counter[str]:
-    """Waits for the graphics card in PyTorch's operations, by file and line; other warnings are not shown."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        with _synchronisations_warn():
-            call()
-    return Counter(f"{w.filename}:{w.lineno}" for w in caught if _WAIT_WARNING in str(w.message))
-
-
-@contextmanager
-def _synchronisations_warn() -> Iterator[None]:
-    before = torch.cuda.get_sync_debug_mode()
-    torch.cuda.set_sync_debug_mode("warn")
-    try:
-        yield
-    finally:
-        torch.cuda.set_sync_debug_mode(before)

@@ -1,4 +1,4 @@
-"""Times, operations and memory of whole calls; on a graphics card its agreement with the CPU and its waits too."""
+"""Times, operations and memory of whole calls; on a graphics card its agreement with the CPU too."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import partial
 
 import torch
 
-from benchmark_suites.measures import count_operations, count_synchronisations, peak_tensor_bytes
+from benchmark_suites.measures import count_operations, peak_tensor_bytes
 from benchmark_suites.timing import Row, Spread, time_interleaved
 from benchmark_suites.workloads import Scene
 from directshape_torch.compile import compiler_problem
@@ -22,9 +22,6 @@ _PRESETS = ("default", "fast")
 # Sums in another order change a step's last digits, and a convergence test that is met one iteration sooner changes the
 # result by less than the test's own tolerance. Cars that settle in another minimum are what the share is for.
 _SAME_CENTRE_M = 0.01
-# Settings with which no car settles, so that every car takes part in every iteration.
-_ENDLESS = ("solver.cost_tolerance=0", "solver.step_tolerance=0", "solver.accept_every_step=true")
-_FEW_BLOCKS, _MANY_BLOCKS, _BLOCK = 2, 6, 4
 
 
 def make_refiner(preset: str, compiled: bool, *overrides: str) -> DirectShapeRefiner:
@@ -61,7 +58,7 @@ def time_rows(scene: Scene, device: torch.device, rounds: int, quick: bool = Fal
 
 
 def device_rows(scenes: Sequence[Scene], device: torch.device) -> Iterator[Row]:
-    """Of a graphics card: the share of cars with the CPU's result, and how often a block of iterations waits for it."""
+    """Of a graphics card: the share of cars with the CPU's result."""
     for scene in scenes:
         refiner, call = make_refiner("default", False), collate(scene.frames)
         expected = refiner(*call).T_cam_obj
@@ -70,18 +67,6 @@ def device_rows(scenes: Sequence[Scene], device: torch.device) -> Iterator[Row]:
         note = f"within {_SAME_CENTRE_M} m; differences of centres, median {1e3 * float(distance_m.median()):.3g} mm"
         share = float((distance_m < _SAME_CENTRE_M).double().mean())
         yield Row(f"{scene.name}: share of cars with the CPU's result", Spread.of([share]), note)
-    call = on_device(*collate(scenes[0].frames[:1]), device)
-    found = [_synchronisations(blocks, call, device) for blocks in (_FEW_BLOCKS, _MANY_BLOCKS)]
-    a_block = (found[1] - found[0]) / (_MANY_BLOCKS - _FEW_BLOCKS)
-    note = f"{_BLOCK} iterations, no car finished; {found[1]} in a call of {_MANY_BLOCKS} blocks"
-    yield Row("waits for the device in a block", Spread.of([a_block]), note)
-
-
-def _synchronisations(blocks: int, call: tuple[FrameBatch, Detections], device: torch.device) -> int:
-    stage = f"stages=[{{contour_width_px: 0.5, image_level: 0, max_iterations: {blocks * _BLOCK}}}]"
-    refiner = make_refiner("default", False, stage, f"solver.block_iterations={_BLOCK}", *_ENDLESS).to(device)
-    refiner(*call)
-    return count_synchronisations(partial(refiner, *call)).total()
 
 
 def on_device(frames: FrameBatch, detections: Detections, device: torch.device) -> tuple[FrameBatch, Detections]:
