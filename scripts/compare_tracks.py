@@ -131,17 +131,16 @@ def _refine(refiner: DirectShapeRefiner, loaded: Sequence[LoadedFrame], views: i
 def _cars(
     item: LoadedFrame, result: RefinementResult, boxes: Tensor, first_row: int, views: int, seconds: float
 ) -> Iterator[CarOfFrame]:
-    labels, objects = item.labels or [], item.detected_objects
-    partners = match_to_labels(objects, labels)
-    rows = [k for k, partner in enumerate(partners) if partner >= 0 and is_counted(labels[partner])]
-    true = boxes_of([labels[partners[k]] for k in rows])
+    objects = item.detected_objects
+    label_of = {k: label for k, label in match_to_labels(objects, item.labels or []).items() if is_counted(label)}
+    rows, true = list(label_of), boxes_of(list(label_of.values()))
     boxes = boxes[[first_row + k for k in rows]]
     errors, before = pose_errors(boxes, true), pose_errors(boxes_of([objects[k] for k in rows]), true)
     reach, true_reach = _reach(boxes, true), _reach(true, true)
     status, sigma = result.status, result.sigma_xyz_yaw
     given, part = _track_id(item).tolist(), result.track_part.tolist()
-    for number, k in enumerate(rows):
-        label, row = labels[partners[k]], first_row + k
+    for number, (k, label) in enumerate(label_of.items()):
+        row = first_row + k
         near, far = (reach[number] - true_reach[number]).tolist()
         yield CarOfFrame(
             sequence=item.sequence or "",

@@ -9,8 +9,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-
-from torch import Tensor
+from statistics import fmean
 
 from directshape_torch.batch.group_refinement import limited_threads
 from directshape_torch.batch.options import RefineOptions
@@ -19,7 +18,7 @@ from directshape_torch.batch.run_summary import format_summary
 from directshape_torch.cli.options import add_config_option, add_device_option, make_refiner
 from directshape_torch.cli.progress import ProgressBar
 from directshape_torch.evaluation.matching import match_to_labels
-from directshape_torch.evaluation.pose_error import PoseErrors, boxes_of, pose_errors
+from directshape_torch.evaluation.pose_error import CarErrors, errors_of
 from directshape_torch.evaluation.tables import align
 from directshape_torch.export.painted_cars import PaintedFrame
 from directshape_torch.export.surface_files import frame_glb
@@ -69,25 +68,21 @@ def run(args: argparse.Namespace) -> int:
 def error_table(loaded: LoadedFrame, result: FrameResult) -> str:
     """Centre, heading and bird's-eye overlap of each car against its label, before and after."""
     before, after = loaded.detected_objects, result.cars
-    labels = loaded.labels or []
-    partners = match_to_labels(before, labels)
-    pairs = [car for car, partner in enumerate(partners) if partner >= 0]
-    true = [labels[partners[car]] for car in pairs]
-    errors = [pose_errors(boxes_of([objects[car] for car in pairs]), boxes_of(true)) for objects in (before, after)]
+    found = match_to_labels(before, loaded.labels or [])
+    sides = [errors_of([objects[car] for car in found], list(found.values())) for objects in (before, after)]
     rows = [["car", "depth", "centre [m]", "yaw [deg]", "BEV IoU", "status"]]
-    for row, car in enumerate(pairs):
-        depth = f"{true[row].location_ref[2]:.1f} m"
-        rows.append([str(before[car].line_number), depth, *_columns(errors, [row]), result.shapes.statuses[car]])
-    if pairs:
-        rows.append(["mean", "", *_columns(errors, range(len(pairs))), ""])
-    return align(rows)
+    for row, (car, label) in enumerate(found.items()):
+        figures = _columns([side[row : row + 1] for side in sides])
+        depth = f"{label.location_ref[2]:.1f} m"
+        rows.append([str(before[car].line_number), depth, *figures, result.shapes.statuses[car]])
+    return align([*rows, ["mean", "", *_columns(sides), ""]] if found else rows)
 
 
-def _columns(errors: Sequence[PoseErrors[Tensor]], rows: Sequence[int]) -> tuple[str, str, str]:
-    """Before and after of centre, yaw and overlap, averaged over the rows."""
+def _columns(sides: Sequence[Sequence[CarErrors]]) -> tuple[str, str, str]:
+    """Before and after of centre, yaw and overlap, averaged over cars."""
 
     def change(name: str, decimals: int) -> str:
-        values = [float(getattr(e, name)[list(rows)].mean()) for e in errors]
+        values = [fmean(getattr(car, name) for car in side) for side in sides]
         return " -> ".join(f"{value:{decimals + 3}.{decimals}f}" for value in values)
 
     return change("centre_m", 2), change("yaw_deg", 1), change("bev_iou", 2)

@@ -162,10 +162,10 @@ def line_of(loaded: LoadedFrame, row: int) -> int:
 
 def true_corners_cam(loaded: LoadedFrame) -> list[NDArray[np.float64] | None]:
     """Corners (8, 3) of the labelled box of each detection, or None."""
-    labels = loaded.labels or []
-    partners = match_to_labels(loaded.detected_objects, labels)
-    corners = box_corners_cam(labels, loaded.frame.camera.t_cam_ref[0]).numpy()
-    return [None if partner < 0 else corners[partner] for partner in partners]
+    found = match_to_labels(loaded.detected_objects, loaded.labels or [])
+    corners = box_corners_cam(list(found.values()), loaded.frame.camera.t_cam_ref[0]).numpy()
+    true = dict(zip(found, corners, strict=True))
+    return [true.get(row) for row in range(len(loaded.detected_objects))]
 
 
 def inspect_tracks(loaded: Sequence[LoadedFrame], refiner: DirectShapeRefiner, out_dir: Path) -> list[Path]:

@@ -179,12 +179,8 @@ def _pairs_of_frame(sources: tuple[Path, Path, Path], frame_id: str) -> tuple[li
     before, after = objects_in(before_path, frame_id), objects_in(after_path, frame_id)
     _check_same_lines(before_path, before, after_path, after)
     lines = [pair for pair in zip(before, after, strict=True) if pair[0].type == "Car" and pair[0].has_box_3d]
-    partners = match_to_labels([old for old, _ in lines], labels)
-    pairs = [
-        _Pair(frame_id, labels[index], *pair)
-        for pair, index in zip(lines, partners, strict=True)
-        if index >= 0 and is_counted(labels[index])
-    ]
+    found = match_to_labels([old for old, _ in lines], labels)
+    pairs = [_Pair(frame_id, label, *lines[row]) for row, label in found.items() if is_counted(label)]
     return pairs, sum(is_counted(label) for label in labels)
 
 

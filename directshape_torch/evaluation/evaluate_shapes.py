@@ -170,9 +170,9 @@ def _evaluated(inputs: _Inputs, frame_id: str) -> tuple[list[EvaluatedCar], int,
     row_of_line = {line: row for row, line in enumerate(shapes.input_lines.tolist())}
     refined = [detection for detection in detections if detection.line_number in row_of_line]
     cars = []
-    for detection, partner in zip(refined, match_to_labels(refined, labels), strict=True):
-        truth = truths.get(labels[partner].line_number) if partner >= 0 else None
-        if truth is None or not is_counted(labels[partner]):
+    for place, label in match_to_labels(refined, labels).items():
+        truth, detection = truths.get(label.line_number), refined[place]
+        if truth is None or not is_counted(label):
             continue
         row = row_of_line[detection.line_number]
         code, T_refined = (torch.from_numpy(array[row]).double() for array in (shapes.codes, shapes.T_cam_obj))
@@ -180,9 +180,9 @@ def _evaluated(inputs: _Inputs, frame_id: str) -> tuple[list[EvaluatedCar], int,
         car = EvaluatedCar(
             frame_id=frame_id,
             detection_line=detection.line_number,
-            label_line=labels[partner].line_number,
+            label_line=label.line_number,
             status=shapes.statuses[row],
-            depth_m=labels[partner].location_ref[2],
+            depth_m=label.location_ref[2],
             segment=truth.segment,
             before=truth.errors(EstimatedCar(prior, prior.initial_code(1)[0], T_input)),
             after=truth.errors(EstimatedCar(prior, code, T_refined)),

@@ -29,22 +29,22 @@ def is_counted(label: KittiObject, types: Collection[str] = ("Car",)) -> bool:
     )
 
 
-def match_to_labels(detections: Sequence[KittiObject], labels: Sequence[KittiObject]) -> list[int]:
-    """For each detection the index of its label, or -1: largest 2D overlap of at least 0.3 first, one to one.
+def match_to_labels(detections: Sequence[KittiObject], labels: Sequence[KittiObject]) -> dict[int, KittiObject]:
+    """The label of each detection that has one, by its place: largest 2D overlap of at least 0.3 first, one to one.
 
     Labels of every class with a 3D box compete, so that a detection of a van is not given to the car behind it; which
     of the matched labels count is another question (`is_counted`). Of equal overlaps the first detection's is taken.
     """
-    known = [index for index, label in enumerate(labels) if label.has_box_3d]
-    overlap = box_iou(_image_boxes(detections), _image_boxes([labels[index] for index in known]))
-    partner = [-1] * len(detections)
+    known = [label for label in labels if label.has_box_3d]
+    overlap = box_iou(_image_boxes(detections), _image_boxes(known))
+    label_of: dict[int, int] = {}
     for place in np.argsort(-overlap, axis=None, kind="stable").tolist():
         row, column = divmod(place, len(known))
         if overlap[row, column] < _MINIMUM_IOU_2D:
             break
-        if partner[row] < 0 and known[column] not in partner:
-            partner[row] = known[column]
-    return partner
+        if row not in label_of and column not in label_of.values():
+            label_of[row] = column
+    return {row: known[column] for row, column in sorted(label_of.items())}
 
 
 def _image_boxes(objects: Sequence[KittiObject]) -> NDArray[np.float64]:

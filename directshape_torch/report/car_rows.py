@@ -102,15 +102,11 @@ def _judged(
 
     Cars are matched by their 2D boxes, which a refinement leaves alone.
     """
-    partners = {car: partner for car, partner in enumerate(match_to_labels(after, labels)) if partner >= 0}
-    cars, true = list(partners), [labels[partner] for partner in partners.values()]
-    types = {o.type for o in after}
-    judged: dict[int, dict[str, Any]] = {
-        car: {"counts": is_counted(label, types)} for car, label in zip(cars, true, strict=True)
-    }
+    found, types = match_to_labels(after, labels), {o.type for o in after}
+    judged: dict[int, dict[str, Any]] = {car: {"counts": is_counted(label, types)} for car, label in found.items()}
     for side, objects in (("before", before), ("after", after)):
-        errors = [] if objects is None else errors_of([objects[car] for car in cars], true)
-        for car, error in zip(cars, errors, strict=False):
+        errors = [] if objects is None else errors_of([objects[car] for car in found], list(found.values()))
+        for car, error in zip(found, errors, strict=False):
             judged[car][f"centre_{side}_m"], judged[car][f"iou_{side}"] = known(error.centre_m), known(error.bev_iou)
             judged[car][f"yaw_{side}_deg"] = known(error.yaw_deg, 2)
     return judged

@@ -16,10 +16,8 @@ from directshape_torch.evaluation.matching import is_counted, match_to_labels
 from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
 from directshape_torch.files.read_files import read_npz
 from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
-from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refinement.quality import EVIDENCE_NAMES
-from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.scene import Detections
@@ -158,10 +156,13 @@ def observe(
 ) -> list[Observations]:
     """The counted, refined cars of one frame, whose detections may have been replaced; none, or one set."""
     result = refiner(loaded.frame, detections)
-    rows, labels = _counted(loaded, result)
-    if not len(rows):
+    assert loaded.labels is not None
+    refined, masked = result.refined.tolist(), loaded.detections.has_mask_left.tolist()
+    found = match_to_labels(loaded.detected_objects, loaded.labels)
+    rows = [row for row, label in found.items() if refined[row] and masked[row] and is_counted(label)]
+    if not rows:
         return []
-    truth, after = boxes_of(labels), result.to_boxes("kitti", "ref")[rows].double()
+    truth, after = boxes_of([found[row] for row in rows]), result.to_boxes("kitti", "ref")[rows].double()
     errors = (after - truth)[:, [0, 1, 2, 6]]
     # A flip by half a turn is the detector's affair: the sigma of the heading does not speak of it.
     errors[:, 3] = wrap_angle(2 * errors[:, 3]) / 2
@@ -180,15 +181,3 @@ def observe(
         ray.numpy(),
     )
     return [Observations(*columns)]
-
-
-def _counted(loaded: LoadedFrame, result: RefinementResult) -> tuple[list[int], list[KittiObject]]:
-    objects = [loaded.input_objects[row] for row in loaded.row_of_detection]
-    assert loaded.labels is not None
-    refined, masked = result.refined.tolist(), loaded.detections.has_mask_left.tolist()
-    pairs = [
-        (row, loaded.labels[partner])
-        for row, partner in enumerate(match_to_labels(objects, loaded.labels))
-        if partner >= 0 and refined[row] and masked[row] and is_counted(loaded.labels[partner])
-    ]
-    return [row for row, _ in pairs], [label for _, label in pairs]

@@ -19,22 +19,22 @@ def _object(
 def test_the_better_detection_takes_the_label():
     labels = [_object((100, 100, 200, 200))]
     detections = [_object((110, 100, 210, 200)), _object((101, 100, 201, 200)), _object((300, 100, 400, 200))]
-    assert match_to_labels(detections, labels) == [-1, 0, -1]
+    assert match_to_labels(detections, labels) == {1: labels[0]}
 
 
 def test_each_detection_takes_its_largest_free_overlap():
     """Columns of a car 100 px wide: moved by 10 it shares 90 of 110, by 40 60 of 140, by 60 40 of 160: too little."""
     labels = [_object((0, 0, 100, 100)), _object((50, 0, 150, 100))]
     near, between, far = (_object((u, 0, u + 100, 100)) for u in (10, 40, -60))
-    assert match_to_labels([near, between, far], labels) == [0, 1, -1]
-    assert match_to_labels([near, near], labels) == [0, 1]
-    assert match_to_labels([far, near], labels[:1]) == [-1, 0]
+    assert match_to_labels([near, between, far], labels) == dict(enumerate(labels))
+    assert match_to_labels([near, near], labels) == dict(enumerate(labels))
+    assert match_to_labels([far, near], labels[:1]) == {1: labels[0]}
 
 
 def test_a_van_keeps_its_detection_and_dontcare_takes_none():
     box = (100, 100, 200, 200)
     labels = [_object((100, 100, 150, 200)), _object(box, "Van"), _object(box, "DontCare")]
-    assert match_to_labels([_object(box)], labels) == [1]
+    assert match_to_labels([_object(box)], labels) == {0: labels[1]}
 
 
 @pytest.mark.parametrize(
