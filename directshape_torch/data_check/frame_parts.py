@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, DirectShapeError
@@ -138,7 +137,7 @@ def _columns(rows: Sequence[tuple[float, ...]], count: int) -> NDArray[np.float6
 def _camera(calibration: KittiCalibration | None) -> StereoCamera | None:
     """None also for a calibration that is no stereo pair's; `check_calibration` says why."""
     try:
-        return None if calibration is None else to_stereo_camera([calibration], dtype=torch.float64)
+        return None if calibration is None else to_stereo_camera(calibration)
     except (DirectShapeError, RuntimeError):  # a singular matrix is a RuntimeError
         return None
 

@@ -159,7 +159,7 @@ def _chosen(inputs: _Inputs, named: tuple[str, ...] | None) -> tuple[str, ...]:
 def _evaluated(inputs: _Inputs, frame_id: str) -> tuple[list[EvaluatedCar], int, int]:
     """The cars of a frame, how many labels count, and how many of these have a true surface."""
     name, prior = f"{frame_id}.txt", inputs.prior
-    camera = to_stereo_camera([read_calibration(inputs.training / "calib" / name)], dtype=torch.float64)
+    camera = to_stereo_camera(read_calibration(inputs.training / "calib" / name))
     labels, detections = (
         read_objects(file_of_frame(folder, name)) for folder in (inputs.labels_dir, inputs.detections_dir)
     )

@@ -200,7 +200,7 @@ def _projected(rig_path: Path, hwl: _Triple, bottom: _Triple, yaw: float) -> tup
     """The 2D box around a 3D box, for objects that give none."""
     calibration = calibration_of(rig_path)
     width, height = calibration.size_wh or (0, 0)
-    camera = to_stereo_camera([calibration], dtype=torch.float64)
+    camera = to_stereo_camera(calibration)
     T_cam_obj = pose_from_kitti(torch.tensor([bottom]).double(), torch.tensor([yaw]).double())
     left, _ = project_boxes(T_cam_obj, torch.tensor([hwl]), camera, (height, width))
     return tuple(float(value) for value in left[0])

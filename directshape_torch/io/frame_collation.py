@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
-from torch.nn.utils.rnn import pad_sequence
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders
+from directshape_torch.scene import Detections, FrameBatch, Occluders
+
+Size = tuple[int, int]  # height and width
 
 
 def collate(loaded: Sequence[LoadedFrame]) -> tuple[FrameBatch, Detections]:
@@ -31,86 +32,33 @@ def collate(loaded: Sequence[LoadedFrame]) -> tuple[FrameBatch, Detections]:
     """
     if not loaded:
         raise InputError("loaded", "at least one frame", "none")
-    shapes = [item.frame.images_left.shape for item in loaded]
-    size_hw = max(shape[-2] for shape in shapes), max(shape[-1] for shape in shapes)
-    grounds = [item.frame.ground for item in loaded]
-    frame = FrameBatch(
-        images_left=_padded([item.frame.images_left for item in loaded], size_hw),
-        images_right=_padded([item.frame.images_right for item in loaded], size_hw),
-        sizes=torch.cat([item.frame.sizes for item in loaded]),
-        camera=_cameras([item.frame.camera for item in loaded]),
-        ground=GroundPlane(
-            torch.cat([ground.normal for ground in grounds]),
-            torch.cat([ground.offset for ground in grounds]),
-            tuple(source for ground in grounds for source in ground.source),
-        ),
-        frame_ids=tuple(frame_id for item in loaded for frame_id in item.frame.frame_ids),
-        disparity=_disparities([item.frame.disparity for item in loaded], size_hw),
-        points_cam=_points([item.frame.points_cam for item in loaded]),
-        time_s=_of_all([item.frame.time_s for item in loaded]),
-        T_world_cam=_of_all([item.frame.T_world_cam for item in loaded]),
-    )
-    return frame, _detections([item.detections for item in loaded], size_hw, _tracks(loaded))
-
-
-def _padded(images: Sequence[Tensor], size_hw: tuple[int, int]) -> Tensor:
-    height, width = size_hw
-    missing = [(width - image.shape[-1], height - image.shape[-2]) for image in images]
-    # Padding by nothing copies too: frames of one size are copied once, into the batch.
-    grown = [
-        image if extra == (0, 0) else pad(image, (0, extra[0], 0, extra[1]))
-        for image, extra in zip(images, missing, strict=True)
-    ]
-    return torch.cat(grown)
-
-
-def _disparities(maps: Sequence[Tensor | None], size_hw: tuple[int, int]) -> Tensor | None:
-    known = _all_or_none(maps, "disparity maps")
-    # Zero is no disparity, like NaN.
-    return _padded(known, size_hw) if known else None
-
-
-def _points(clouds: Sequence[Tensor | None]) -> Tensor | None:
-    known = [points[0] for points in _all_or_none(clouds, "LiDAR points")]
-    return pad_sequence(known, batch_first=True, padding_value=torch.nan) if known else None
-
-
-def _all_or_none(parts: Sequence[Tensor | None], what: str) -> list[Tensor]:
-    known = [part for part in parts if part is not None]
-    if known and len(known) < len(parts):
-        raise InputError("loaded", f"frames with {what}, or frames without", f"{len(known)} of {len(parts)} with")
-    return known
-
-
-def _of_all(parts: Sequence[Tensor | None]) -> Tensor | None:
-    """Of all frames; None where one is without."""
-    known = [part for part in parts if part is not None]
-    return torch.cat(known) if len(known) == len(parts) else None
-
-
-def _cameras(cameras: Sequence[StereoCamera]) -> StereoCamera:
-    field = cameras[0].disparity_field
-    if any(not _same_field(camera.disparity_field, field) for camera in cameras):
+    if len(split_by_rig(loaded)) > 1:
         raise InputError("loaded", "frames with the same residual disparity field", "frames that differ in it")
-    K_left, K_right, T_right_cam, t_cam_ref = (
-        torch.cat([getattr(camera, name) for camera in cameras])
-        for name in ("K_left", "K_right", "T_right_cam", "t_cam_ref")
-    )
-    return StereoCamera(K_left, K_right, T_right_cam, t_cam_ref, field)
+    frames, cars = [item.frame for item in loaded], [item.detections for item in loaded]
+    shapes = [frame.images_left.shape for frame in frames]
+    size_hw = max(shape[-2] for shape in shapes), max(shape[-1] for shape in shapes)
+    batch = FrameBatch.joined(_alike(frames, size_hw))
+    optional = ("pose_sigma", "offset_sigma_px", "track_id")
+    known = {name for name in optional if any(getattr(part, name) is not None for part in cars)}
+    sequences = list(dict.fromkeys(item.sequence for item in loaded))
+    places = [sequences.index(item.sequence) for item in loaded]
+    parts = [
+        _numbered(_filled(part, known, size_hw), number, place, len(sequences))
+        for number, (part, place) in enumerate(zip(cars, places, strict=True))
+    ]
+    return batch, Detections.joined(parts)
 
 
 def split_by_rig(loaded: Sequence[LoadedFrame]) -> list[list[int]]:
     """Numbers of the frames that `collate` takes together: those with the same residual disparity field."""
     parts: list[list[int]] = []
-    fields_of_parts: list[DisparityField | None] = []
     for number, item in enumerate(loaded):
         field = item.frame.camera.disparity_field
-        same = [part for part, other in zip(parts, fields_of_parts, strict=True) if _same_field(field, other)]
+        same = [part for part in parts if _same_field(field, loaded[part[0]].frame.camera.disparity_field)]
         if same:
             same[0].append(number)
         else:
             parts.append([number])
-            fields_of_parts.append(field)
     return parts
 
 
@@ -121,51 +69,60 @@ def _same_field(a: DisparityField | None, b: DisparityField | None) -> bool:
     return a.size_wh == b.size_wh and all(torch.equal(getattr(a, name), getattr(b, name)) for name in tensors)
 
 
-def _tracks(loaded: Sequence[LoadedFrame]) -> Tensor | None:
-    """(B,) those of one sequence as they are; of several sequences so that none is that of another."""
-    tracks = _known_rows(
-        [(d.track_id, torch.full_like(d.frame_index, -1)) for d in (item.detections for item in loaded)]
-    )
-    places = {sequence: place for place, sequence in enumerate(dict.fromkeys(item.sequence for item in loaded))}
-    if tracks is None or len(places) == 1:
-        return tracks
-    place = torch.cat([torch.full_like(item.detections.frame_index, places[item.sequence]) for item in loaded])
-    return torch.where(tracks < 0, tracks, tracks * len(places) + place)
+def _alike(frames: Sequence[FrameBatch], size_hw: Size) -> list[FrameBatch]:
+    """Padded to one size, with the optional tensors that all of them have."""
+    known = {}
+    for name in ("disparity", "points_cam", "time_s", "T_world_cam"):
+        count = sum(getattr(frame, name) is not None for frame in frames)
+        if name in ("disparity", "points_cam") and 0 < count < len(frames):
+            raise InputError("loaded", f"frames with {name}, or frames without", f"{count} of {len(frames)} with")
+        known[name] = count == len(frames)
+    most = max(0 if frame.points_cam is None else frame.points_cam.shape[1] for frame in frames)
+    alike = []
+    for frame in frames:
+        optional = {name: getattr(frame, name) for name, of_all in known.items() if of_all}
+        if known["disparity"]:  # zero is no disparity, like NaN
+            optional["disparity"] = _padded(optional["disparity"], size_hw)
+        if known["points_cam"]:
+            points = optional["points_cam"]
+            optional["points_cam"] = pad(points, (0, 0, 0, most - points.shape[1]), value=torch.nan)
+        images: dict[str, Any] = {
+            side: _padded(getattr(frame, side), size_hw) for side in ("images_left", "images_right")
+        }
+        alike.append(replace(frame, **images | dict.fromkeys(known) | optional))
+    return alike
 
 
-def _detections(parts: Sequence[Detections], size_hw: tuple[int, int], track_id: Tensor | None) -> Detections:
-    rows = {
-        name: torch.cat([getattr(part, name) for part in parts])
-        for name in ("T_cam_obj", "dimensions_hwl", "box_2d", "score", "has_mask_left", "has_mask_right")
+def _filled(d: Detections, known: set[str], size_hw: Size) -> Detections:
+    """Padded, with occluders, and with what other frames have for what is not known."""
+    nothing = {
+        "pose_sigma": d.T_cam_obj.new_full((len(d), 4), torch.inf),
+        "offset_sigma_px": torch.zeros_like(d.T_cam_obj[:, 0, 0]),
+        "track_id": torch.full_like(d.frame_index, -1),
     }
-    occluders = [part.occluders for part in parts]
-    return Detections(
-        frame_index=torch.cat([part.frame_index + number for number, part in enumerate(parts)]),
-        mask_left=_padded([part.mask_left for part in parts], size_hw),
-        mask_right=_padded([part.mask_right for part in parts], size_hw),
-        occluders=_occluders(occluders, size_hw),
-        pose_sigma=_known_rows([(p.pose_sigma, p.T_cam_obj.new_full((len(p), 4), torch.inf)) for p in parts]),
-        offset_sigma_px=_known_rows([(p.offset_sigma_px, torch.zeros_like(p.T_cam_obj[:, 0, 0])) for p in parts]),
-        track_id=track_id,
-        **rows,
+    hidden = d.occluders or Occluders(d.frame_index[:0], d.mask_left[:0], d.mask_right[:0], d.score[:0], d.score[:0])
+    return replace(
+        d,
+        mask_left=_padded(d.mask_left, size_hw),
+        mask_right=_padded(d.mask_right, size_hw),
+        occluders=replace(
+            hidden, mask_left=_padded(hidden.mask_left, size_hw), mask_right=_padded(hidden.mask_right, size_hw)
+        ),
+        **{name: nothing[name] for name in known if getattr(d, name) is None},
     )
 
 
-def _known_rows(parts: Sequence[tuple[Tensor | None, Tensor]]) -> Tensor | None:
-    """Rows of all frames, the second of each pair for the frames without; None without any."""
-    if all(given is None for given, _ in parts):
-        return None
-    return torch.cat([none if given is None else given for given, none in parts])
+def _numbered(d: Detections, number: int, sequence: int, num_sequences: int) -> Detections:
+    """Of the frame of that number; no track of a sequence is that of another."""
+    tracks, hidden = d.track_id, d.occluders
+    if tracks is not None and num_sequences > 1:
+        tracks = torch.where(tracks < 0, tracks, tracks * num_sequences + sequence)
+    if hidden is not None:
+        hidden = replace(hidden, frame_index=hidden.frame_index + number)
+    return replace(d, frame_index=d.frame_index + number, occluders=hidden, track_id=tracks)
 
 
-def _occluders(parts: Sequence[Occluders | None], size_hw: tuple[int, int]) -> Occluders | None:
-    numbered = [(number, part) for number, part in enumerate(parts) if part is not None]
-    if not numbered:
-        return None
-    return Occluders(
-        frame_index=torch.cat([part.frame_index + number for number, part in numbered]),
-        mask_left=_padded([part.mask_left for _, part in numbered], size_hw),
-        mask_right=_padded([part.mask_right for _, part in numbered], size_hw),
-        depth_m=torch.cat([part.depth_m for _, part in numbered]),
-        bottom_v=torch.cat([part.bottom_v for _, part in numbered]),
-    )
+def _padded(images: Tensor, size_hw: Size) -> Tensor:
+    """Padding by nothing copies too: frames of one size are copied once, into the batch."""
+    extra = (0, size_hw[1] - images.shape[-1], 0, size_hw[0] - images.shape[-2])
+    return pad(images, extra) if any(extra) else images

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from directshape_torch.geometry.stereo_camera import StereoCamera
 
 _PLANE_CURE = "write four lines: '# Plane', 'Width 4', 'Height 1', then a b c d with a x + b y + c z + d = 0"
 # The name of each matrix in the object, the tracking and the raw layout, and its shape.
-_LAYOUTS: dict[str, tuple[str, tuple[int, int]]] = {
+_CAMERAS: dict[str, tuple[str, tuple[int, int]]] = {
     "P2": ("P2", (3, 4)),
     "P_rect_02": ("P2", (3, 4)),
     "P3": ("P3", (3, 4)),
@@ -30,6 +30,7 @@ _LAYOUTS: dict[str, tuple[str, tuple[int, int]]] = {
     "Tr_velo_to_cam": ("Tr_velo_to_cam", (3, 4)),
     "Tr_velo_cam": ("Tr_velo_to_cam", (3, 4)),
 }
+_LIDAR = {"R": ("R", (3, 3)), "T": ("T", (3, 1))}
 
 
 @dataclass(frozen=True)
@@ -53,59 +54,43 @@ class KittiCalibration:
 
 
 def read_calibration(path: Path | str) -> KittiCalibration:
-    """Read a KITTI calibration file (object `calib/NNNNNN.txt`, tracking `calib.txt`, raw `calib_cam_to_cam.txt`).
-
-    Lines are `name: numbers`, the colon being optional.
-    """
-    matrices: dict[str, Any] = {}
-    for line in read_lines(path):
-        words = line.text.split()
-        name, shape = _LAYOUTS.get(words[0].rstrip(":"), (None, (0, 0)))
-        if name is not None:
-            matrices[name] = finite_numbers(path, line, shape[0] * shape[1], words[1:]).reshape(shape)
-    for name in ("P2", "P3"):
-        if name not in matrices:
-            raise DataFormatError(path, f"has no line {name}:", cure="a stereo pair needs the projections P2 and P3")
-    return KittiCalibration(Path(path), **matrices)
+    """Read a KITTI calibration file (object `calib/NNNNNN.txt`, tracking `calib.txt`, raw `calib_cam_to_cam.txt`)."""
+    cure = "a stereo pair needs the projections P2 and P3"
+    return KittiCalibration(Path(path), **_read_matrices(path, _CAMERAS, ("P2", "P3"), cure))
 
 
 def read_velo_to_cam(path: Path | str) -> NDArray[np.float64]:
     """LiDAR to camera 0, (3, 4), metres, from `calib_velo_to_cam.txt` of the raw recordings (lines `R:` and `T:`)."""
-    found: dict[str, NDArray[np.float64]] = {}
+    cure = "a scan needs rotation and translation of its LiDAR"
+    found = _read_matrices(path, _LIDAR, ("R", "T"), cure)
+    return np.concatenate([found["R"], found["T"]], axis=1)
+
+
+def _read_matrices(
+    path: Path | str, known: Mapping[str, tuple[str, tuple[int, int]]], needed: Sequence[str], cure: str
+) -> dict[str, Any]:
+    """The matrices in lines of `name: numbers`, the colon being optional; further lines are passed over."""
+    matrices: dict[str, Any] = {}
     for line in read_lines(path):
         words = line.text.split()
-        shape = {"R:": (3, 3), "T:": (3, 1)}.get(words[0])
-        if shape is not None:
-            found[words[0]] = finite_numbers(path, line, shape[0] * shape[1], words[1:]).reshape(shape)
-    for name in ("R:", "T:"):
-        if name not in found:
-            raise DataFormatError(
-                path, f"has no line {name}", cure="a scan needs rotation and translation of its LiDAR"
-            )
-    return np.concatenate([found["R:"], found["T:"]], axis=1)
+        name, shape = known.get(words[0].rstrip(":"), (None, (0, 0)))
+        if name is not None:
+            matrices[name] = finite_numbers(path, line, shape[0] * shape[1], words[1:]).reshape(shape)
+    for name in needed:
+        if name not in matrices:
+            raise DataFormatError(path, f"has no line {name}:", cure=cure)
+    return matrices
 
 
-def to_stereo_camera(
-    calibrations: Sequence[KittiCalibration],
-    disparity_field: DisparityField | None = None,
-    dtype: torch.dtype = torch.float32,
-) -> StereoCamera:
-    """The stereo cameras of F frames: `K = P2[:, :3]`, `x_cam = x_ref + K^-1 P2[:, 3]`, right camera from P3."""
-    if not calibrations:
-        raise InputError("calibrations", "at least one frame", "none")
-    for calibration in calibrations:
-        _check_baseline(calibration)
-    P2, P3 = (
-        torch.from_numpy(np.stack([getattr(calibration, name) for calibration in calibrations]))
-        for name in ("P2", "P3")
-    )
+def to_stereo_camera(calibration: KittiCalibration) -> StereoCamera:
+    """The camera of one frame, float64: `K = P2[:, :3]`, `x_cam = x_ref + K^-1 P2[:, 3]`, the right one from P3."""
+    P2, P3 = (torch.from_numpy(matrix)[None] for matrix in (calibration.P2, calibration.P3))
+    if not min(P2[0, 0, 0], P3[0, 0, 0]) > 0:
+        raise DataFormatError(calibration.path, "P2 and P3 need focal lengths above 0")
     try:
-        return StereoCamera.from_projections(P2, P3, disparity_field).to(dtype=dtype)
+        return StereoCamera.from_projections(P2, P3)
     except InputError as error:
-        # A field of another rig is no fault of the file.
-        if error.name == "disparity_field":
-            raise
-        raise DataFormatError(calibrations[0].path, f"describes no stereo rig ({error})") from error
+        raise DataFormatError(calibration.path, f"P2 and P3 describe no stereo rig: {error}") from error
 
 
 def camera_of_rig(
@@ -114,41 +99,20 @@ def camera_of_rig(
     size_wh: tuple[int, int],
     dtype: torch.dtype = torch.float32,
 ) -> StereoCamera:
-    """The stereo camera of a frame, with the disparity field of its rig where there are fields."""
+    """The stereo camera of a frame, with the first of some disparity fields that is of its rig, if there are any."""
     calibration.check_size(size_wh)
-    rig = to_stereo_camera([calibration], dtype=torch.float64)
-    field = _field_of_rig(fields, size_wh, rig)
-    return replace(rig, disparity_field=field).to(dtype=dtype)
-
-
-def _field_of_rig(
-    fields: Sequence[DisparityField], size_wh: tuple[int, int], rig: StereoCamera
-) -> DisparityField | None:
-    """The first of some fields that is of this rig; None where there are none."""
+    rig = to_stereo_camera(calibration)
     refusal: InputError | None = None
-    for one in fields:
+    for field in fields:
         try:
-            one.check_rig(size_wh, rig.K_left[0], rig.K_right[0], rig.T_right_cam[0])
+            field.check_rig(size_wh, rig.K_left[0], rig.K_right[0], rig.T_right_cam[0])
         except InputError as error:
             refusal = refusal or error
         else:
-            return one
+            return replace(rig, disparity_field=field).to(dtype=dtype)
     if refusal is not None:
         raise refusal
-    return None
-
-
-def _check_baseline(calibration: KittiCalibration) -> None:
-    """Name the file: `StereoCamera` would only name the tensor."""
-    if not min(calibration.P2[0, 0], calibration.P3[0, 0]) > 0:
-        raise DataFormatError(calibration.path, "P2 and P3 need focal lengths above 0")
-    baseline_m = calibration.P2[0, 3] / calibration.P2[0, 0] - calibration.P3[0, 3] / calibration.P3[0, 0]
-    if not baseline_m > 0:
-        raise DataFormatError(
-            calibration.path,
-            f"the camera of P3 is not to the right of that of P2 (baseline {baseline_m:.4f} m)",
-            cure="swap P2 and P3, or the sign of their fourth columns",
-        )
+    return rig.to(dtype=dtype)
 
 
 def read_plane(path: Path | str) -> NDArray[np.float64]:

@@ -223,8 +223,7 @@ class StereoDataset:
             raise InputError("dataset", "one with LiDAR scans", "none", "open it with lidar_dir=..")
         files = self.layout.files(frame_id)
         calibration = files.read_lidar_calibration()
-        camera = to_stereo_camera([calibration], dtype=torch.float64)
-        return read_scan(files.within(self.lidar_dir, ".bin"), calibration, camera), camera
+        return read_scan(files.within(self.lidar_dir, ".bin"), calibration), to_stereo_camera(calibration)
 
     def objects(self, frame_id: str) -> list[KittiObject]:
         """The detections of a frame alone, without its images."""

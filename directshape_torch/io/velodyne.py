@@ -13,13 +13,13 @@ from directshape_torch.errors import DataFormatError
 from directshape_torch.files.read_files import read_bytes, read_npy
 from directshape_torch.geometry.projection import project
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.kitti_calibration import KittiCalibration
+from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 
 _BYTES_A_POINT = 16
 _NEAREST_M = 1.0
 
 
-def read_scan(path: Path | str, calibration: KittiCalibration, camera: StereoCamera) -> Tensor:
+def read_scan(path: Path | str, calibration: KittiCalibration) -> Tensor:
     """All points of a scan (P, 3), float64, metres, in the left camera; its calibration says where the scanner is."""
     if calibration.R0_rect is None or calibration.Tr_velo_to_cam is None:
         missing = "R0_rect" if calibration.R0_rect is None else "Tr_velo_to_cam"
@@ -29,7 +29,7 @@ def read_scan(path: Path | str, calibration: KittiCalibration, camera: StereoCam
     points_velo = read_points(path)
     rotation = calibration.R0_rect @ calibration.Tr_velo_to_cam[:, :3]
     points_ref = points_velo @ rotation.T + calibration.R0_rect @ calibration.Tr_velo_to_cam[:, 3]
-    return torch.from_numpy(points_ref) + camera.t_cam_ref[0].double()
+    return torch.from_numpy(points_ref) + to_stereo_camera(calibration).t_cam_ref[0]
 
 
 def read_points(path: Path | str) -> NDArray[np.float64]:

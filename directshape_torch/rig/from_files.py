@@ -94,7 +94,7 @@ def _rig_of_first(dataset: StereoDataset, frame_ids: Sequence[str], rigs: list[R
         with suppress(DirectShapeError, OSError):
             files = dataset.layout.files(frame_id)
             height, width = read_rgb(files.left).shape[:2]
-            camera = to_stereo_camera([files.read_calibration()], dtype=torch.float64)
+            camera = to_stereo_camera(files.read_calibration())
             return rig_among(rigs, Rig.of(camera, (width, height)))
     return None
 
@@ -119,7 +119,7 @@ def truth_files(root: Path, source: TruthSource) -> dict[str, Path]:
 def observe_frame(files: FrameFiles, truth: Path, source: TruthSource) -> Frame:
     """Read one frame and measure its disparities where the truth is known."""
     calibration, (left, right) = files.read_calibration(), read_pair(files.left, files.right)
-    rig = Rig.of(to_stereo_camera([calibration], dtype=torch.float64), (left.shape[1], left.shape[0]))
+    rig = Rig.of(to_stereo_camera(calibration), (left.shape[1], left.shape[0]))
     known = _of_map(truth, rig) if source == "disparity" else known_depth_from_lidar(truth, calibration, rig)
     return rig, observe_disparity(MatchedPair.of(left, right), rig, known)
 
@@ -136,7 +136,7 @@ def add_truth(rigs: list[RigEstimate], source: TruthSource, frames: Sequence[Fra
 
 def known_depth_from_lidar(path: Path, calibration: KittiCalibration, rig: Rig) -> Tensor:
     """Scan points (P, 3) u, v, depth that fall into the left image and are not hidden from the camera."""
-    points_cam = read_scan(path, calibration, to_stereo_camera([calibration], dtype=torch.float64))
+    points_cam = read_scan(path, calibration)
     points_cam = points_cam[(points_cam[:, 2] > _DEPTH_RANGE_M[0]) & (points_cam[:, 2] < _DEPTH_RANGE_M[1])]
     known = torch.cat([project(points_cam, rig.K_left), points_cam[:, 2:]], dim=1)
     limit = torch.tensor(rig.size_wh, dtype=torch.float64) - 1
@@ -203,7 +203,7 @@ def observe_motion(frames: Iterable[FrameFiles], height_m: float | None) -> list
     waiting: deque[StereoFeatures] = deque(maxlen=max(STEPS) + 1)
     for files in frames:
         left, right = read_pair(files.left, files.right)
-        camera = to_stereo_camera([files.read_calibration()], dtype=torch.float64)
+        camera = to_stereo_camera(files.read_calibration())
         rig = Rig.of(camera, (left.shape[1], left.shape[0]))
         if waiting and waiting[0].rig.size_wh != rig.size_wh:
             (width, height), before = rig.size_wh, waiting[0].rig.size_wh

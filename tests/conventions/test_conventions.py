@@ -52,7 +52,7 @@ def vector(*values: float) -> Tensor:
 
 def camera():  # type: ignore[no-untyped-def]
     calibration = KittiCalibration(Path("calib.txt"), P2.numpy(), P3.numpy())
-    return to_stereo_camera([calibration], dtype=torch.float64)
+    return to_stereo_camera(calibration)
 
 
 def sentences() -> list[int]:

@@ -206,7 +206,7 @@ def test_the_label_of_a_real_frame_beats_a_noisy_detection(tmp_path: Path) -> No
     assert main([*map(str, words), "--set", "stages=[{max_iterations: 1}]"]) == 0
     path = tmp_path / "shapes" / "007322.npz"
     shapes = read_shapes(path)
-    camera = to_stereo_camera([read_calibration(data / "training" / "calib" / "007322.txt")], dtype=torch.float64)
+    camera = to_stereo_camera(read_calibration(data / "training" / "calib" / "007322.txt"))
     labels = read_objects(data / "training" / "label_2" / "007322.txt")[:1]
     T_label = poses_cam(labels, camera.t_cam_ref[0]).numpy()
     write_shapes(path, dataclasses.replace(shapes, T_cam_obj=T_label, codes=np.zeros_like(shapes.codes)))

@@ -102,7 +102,7 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
     (folder / "boxes.txt").write_text("10 2 -1 3.9 1.6 1.5 0.3\n" * 3)
 
     def scan(path: Path) -> object:
-        return read_scan(path, read_calibration(calibration), street.frames.camera)
+        return read_scan(path, read_calibration(calibration))
 
     def solid(path: Path) -> object:
         grid, options = GridSpec.for_cars(0.5), MeshOptions(voxel_m=0.1)

@@ -76,7 +76,7 @@ def write_stereo2015(kitti: Path, root: Path, frame_ids: tuple[str, ...]) -> Non
 def write_folder(kitti: Path, root: Path, frame_ids: tuple[str, ...]) -> None:
     """The plain folder, boxes moved from ref to the left camera and with their masks beside them."""
     calibration = read_calibration(kitti / "training" / "calib" / f"{frame_ids[0]}.txt")
-    camera = to_stereo_camera([calibration])
+    camera = to_stereo_camera(calibration)
     t_cam_ref = [float(value) for value in camera.t_cam_ref[0].double()]
     rig = {
         "schema_version": FOLDER_SCHEMA_VERSION,

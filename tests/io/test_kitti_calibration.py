@@ -53,8 +53,10 @@ def test_bad_lines(tmp_path: Path, old: str, new: str, message: str) -> None:
 
 def test_flipped_baseline_names_the_file(tmp_path: Path) -> None:
     text = f"P2: {P3}\nP3: {P2}\n"
-    with pytest.raises(DataFormatError, match=r"000000\.txt: the camera of P3 is not to the right .*-0\.53\d\d m"):
-        to_stereo_camera([read_calibration(write(tmp_path, text))])
+    with pytest.raises(
+        DataFormatError, match=r"000000\.txt: P2 and P3 describe no stereo rig: .*baseline -0\.53\d\d m"
+    ):
+        to_stereo_camera(read_calibration(write(tmp_path, text)))
 
 
 HEADER = "# Plane\nWidth 4\nHeight 1\n"

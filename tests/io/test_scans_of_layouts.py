@@ -49,7 +49,7 @@ def scanned(layout: FrameLayout, frame_id: str, kitti: Path) -> Points:
         layout.files(frame_id).read_lidar_calibration(),
         kitti / "training" / "velodyne" / f"{FRAME}.bin",
     )
-    known = known_depth_from_lidar(scan, calibration, Rig.of(to_stereo_camera([calibration]), SIZE_WH))
+    known = known_depth_from_lidar(scan, calibration, Rig.of(to_stereo_camera(calibration), SIZE_WH))
     return known[:, :2], known[:, 2]
 
 

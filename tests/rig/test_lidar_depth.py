@@ -24,7 +24,7 @@ def calibration() -> KittiCalibration:
 
 
 def rig() -> Rig:
-    return Rig.of(to_stereo_camera([calibration()]), SIZE)
+    return Rig.of(to_stereo_camera(calibration()), SIZE)
 
 
 def test_a_point_right_behind_a_nearer_one_and_those_outside_are_left_out(tmp_path: Path) -> None:
