@@ -139,7 +139,7 @@ def read_lines(path: Path | str) -> list[Line]:
 def finite_numbers(
     path: Path | str, line: Line, count: int, words: Sequence[str] | None = None, cure: str = ""
 ) -> NDArray[np.float64]:
-    """The numbers (count,) of a line, or of some of its words.
+    """The numbers (count,) of a line, or of its last words.
 
     Raises:
         DataFormatError: it holds something else, or not as many; names file and line.
@@ -148,13 +148,23 @@ def finite_numbers(
         >>> finite_numbers("calib.txt", Line(3, "1 2.5", "1 2.5"), 2)
         array([1. , 2.5])
     """
+    columns = line.text.split()
+    words = columns if words is None else words
+    if len(words) != count:
+        raise line.error(path, f"expected {count} finite numbers, got {len(words)}", cure)
+    values = [_finite(word) for word in words]
+    if None in values:
+        place = values.index(None)
+        column = len(columns) - count + place + 1
+        raise line.error(path, f"column {column} is {words[place]!r}, not a finite number", cure)
+    return np.array(values, dtype=np.float64)
+
+
+def _finite(word: str) -> float | None:
     try:
-        values = np.array([float(word) for word in (line.text.split() if words is None else words)])
-    except ValueError as error:
-        raise line.error(path, f"expected {count} numbers ({error})", cure) from error
-    if len(values) != count or not np.isfinite(values).all():
-        raise line.error(path, f"expected {count} finite numbers, got {len(values)}", cure)
-    return values
+        return float(word) if math.isfinite(float(word)) else None
+    except ValueError:
+        return None
 
 
 def read_json(path: Path | str, cure: str = "") -> Any:

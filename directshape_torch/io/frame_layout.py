@@ -68,7 +68,7 @@ class FrameFiles:
         if self.labels is None or not self.labels.is_file():
             return None
         of_frame = self.labels.stem in self.stems
-        return read_objects(self.labels, with_score=False) if of_frame else objects_in(self.labels, *self.stems)
+        return read_objects(self.labels, is_label=True) if of_frame else objects_in(self.labels, *self.stems)
 
     def read_plane(self, needed: bool = False) -> NDArray[np.float64] | None:
         """The ground plane (a, b, c, d), see `kitti_calibration.read_plane`; None where there is none and none is

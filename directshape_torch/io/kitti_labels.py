@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.files.read_files import Line, read_lines, remembered
+from directshape_torch.files.read_files import Line, finite_numbers, read_lines, remembered
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.instance_masks import file_of_frame
 
@@ -44,16 +44,17 @@ class KittiObject:
         return min(self.hwl) > 0 and self.location_ref[2] != _NO_LOCATION_M
 
 
-def read_objects(path: Path | str, with_score: bool | None = None) -> list[KittiObject]:
-    """Read a KITTI label (15 columns) or result file (16, `with_score`), or by None either; empty files are fine."""
-    return [parse_object(path, line, with_score) for line in read_lines(path)]
+def read_objects(path: Path | str, is_label: bool = False) -> list[KittiObject]:
+    """Read a KITTI label file (15 columns a line), or unless `is_label` a result file too (16); both may be empty."""
+    return [parse_object(path, line, is_label) for line in read_lines(path)]
 
 
-def parse_object(path: Path | str, line: Line, with_score: bool | None = None) -> KittiObject:
+def parse_object(path: Path | str, line: Line, is_label: bool = False) -> KittiObject:
     """One object from a line of the file `path` (named in errors)."""
     words = line.text.split()
-    _check_column_count(path, line, len(words), with_score)
-    numbers = _finite_numbers(path, line, words[1:])
+    if len(words) not in ((15,) if is_label else (15, 16)):
+        raise line.error(path, f"expected 15{'' if is_label else ' or 16'} columns, got {len(words)}", _CURE)
+    numbers = finite_numbers(path, line, len(words) - 1, words[1:], _CURE).tolist()
     return KittiObject(
         type=words[0],
         truncated=numbers[0],
@@ -67,25 +68,6 @@ def parse_object(path: Path | str, line: Line, with_score: bool | None = None) -
         raw_line=line.raw,
         line_number=line.number,
     )
-
-
-def _check_column_count(path: Path | str, line: Line, count: int, with_score: bool | None) -> None:
-    allowed = {None: (15, 16), False: (15,), True: (16,)}[with_score]
-    if count not in allowed:
-        raise line.error(path, f"expected {' or '.join(map(str, allowed))} columns, got {count}", _CURE)
-
-
-def _finite_numbers(path: Path | str, line: Line, words: Sequence[str]) -> list[float]:
-    numbers = []
-    for column, word in enumerate(words, start=2):
-        try:
-            number = float(word)
-        except ValueError:
-            number = float("nan")
-        if not abs(number) < float("inf"):
-            raise line.error(path, f"column {column} is {word!r}, not a finite number", _CURE)
-        numbers.append(number)
-    return numbers
 
 
 def poses_cam(

@@ -270,17 +270,17 @@ def write_tracks(out_dir: Path | str, frames: Iterable[ShapeArrays]) -> None:
 
 
 def _track(track: str, views: list[tuple[ShapeArrays, int]]) -> TrackArrays:
-    def stacked(name: str) -> NDArray[np.float64]:
+    def stacked(name: str) -> Floats:
         return np.stack([getattr(shapes, name)[car] for shapes, car in views])
 
     statuses = tuple(shapes.statuses[car] for shapes, car in views)
-    codes, covariances = stacked("codes"), stacked("covariances")
+    codes, covariances, boxes_hwl = stacked("codes"), stacked("covariances"), stacked("boxes_hwl")
     is_refined = np.array([Status[status].is_refined for status in statuses])
     # A view that was not refined knows nothing, and a covariance that is not finite says nothing.
     variance = np.trace(covariances[:, 6:, 6:], axis1=1, axis2=2)
     best = int(np.argmin(np.where(is_refined & np.isfinite(variance), variance, np.inf)))
     unknown = 1.0 if is_refined.any() else np.nan
-    boxes_hwl = stacked("boxes_hwl")
+    same = ("T_cam_obj", "T_ref_obj", "boxes_location_ref", "boxes_rotation_y")
     return TrackArrays(
         track=track,
         prior_sha256=views[0][0].prior_sha256,
@@ -291,11 +291,8 @@ def _track(track: str, views: list[tuple[ShapeArrays, int]]) -> TrackArrays:
         input_lines=stacked("input_lines").astype(np.int64),
         statuses=statuses,
         parts=stacked("track_parts").astype(np.int64),
-        T_cam_obj=stacked("T_cam_obj"),
-        T_ref_obj=stacked("T_ref_obj"),
         boxes_hwl=boxes_hwl,
-        boxes_location_ref=stacked("boxes_location_ref"),
-        boxes_rotation_y=stacked("boxes_rotation_y"),
         codes=codes,
         covariances=covariances,
+        **{name: stacked(name) for name in same},
     )

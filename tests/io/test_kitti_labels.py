@@ -38,24 +38,22 @@ def test_dont_care_has_no_3d_box(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "with_score", "message"),
+    ("line", "is_label", "message"),
     [
         (
             LABEL.rsplit(" ", 1)[0],
-            None,
+            False,
             r"000107\.txt, line 2: expected 15 or 16 columns, got 14: 'Car 0\.81 .*'; write",
         ),
-        (LABEL, True, "line 2: expected 16 columns, got 15"),
-        (RESULT, False, "line 2: expected 15 columns, got 16"),
-        (LABEL.replace("4.31", "4,31"), None, "line 2: column 14 is '4,31', not a finite number"),
-        (LABEL.replace("4.31", "nan"), None, "column 14 is 'nan'"),
-        (LABEL.replace("4.31", "-inf"), None, "column 14 is '-inf'"),
+        (RESULT, True, "line 2: expected 15 columns, got 16"),
+        (LABEL.replace("4.31", "4,31"), False, "line 2: column 14 is '4,31', not a finite number"),
+        (LABEL.replace("4.31", "nan"), False, "column 14 is 'nan'"),
+        (LABEL.replace("4.31", "-inf"), False, "column 14 is '-inf'"),
     ],
 )
-def test_bad_lines_name_file_number_and_text(tmp_path: Path, line: str, with_score: bool | None, message: str) -> None:
-    good = RESULT if with_score else LABEL
+def test_bad_lines_name_file_number_and_text(tmp_path: Path, line: str, is_label: bool, message: str) -> None:
     with pytest.raises(DataFormatError, match=message):
-        read_objects(write(tmp_path, f"{good}\n{line}\n"), with_score)
+        read_objects(write(tmp_path, f"{LABEL}\n{line}\n"), is_label)
 
 
 def test_binary_file(tmp_path: Path) -> None:
