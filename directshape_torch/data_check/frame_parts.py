@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from directshape_torch.errors import DataFormatError, DirectShapeError
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_detections import match_masks
-from directshape_torch.io.image_files import read_rgb
+from directshape_torch.io.image_files import as_pair, read_rgb
 from directshape_torch.io.instance_masks import SIDES, InstanceMask, MaskSizeError
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
@@ -48,40 +48,34 @@ def read_parts(dataset: StereoDataset, frame_id: str) -> tuple[FrameParts, list[
         try:
             return read()
         except (DirectShapeError, OSError) as error:
+            if isinstance(error, MaskSizeError):
+                check, expected = "mask_size", "masks of the size of their image"
+            found = unreadable(check, f"frame {frame_id}", expected, error, "check the path and the file")
             is_missing = isinstance(error, DataFormatError) and not error.path.exists()
-            found = _unreadable(check, frame_id, expected, error)
             # That a file is missing is found for all frames at once, and one file may hold several parts.
             if not is_missing and found.measured not in {finding.measured for finding in findings}:
                 findings.append(found)
             return None
 
-    files = dataset.layout.files(frame_id)
+    files, pair, masks = dataset.layout.files(frame_id), None, None
     left = attempt("left_image", "a whole PNG or JPEG", lambda: read_rgb(files.left))
     right = attempt("right_image", "a whole PNG or JPEG", lambda: read_rgb(files.right))
-    if left is not None and right is not None and left.shape != right.shape:
-        findings.append(_other_size(frame_id, left.shape, right.shape))
-        left = None
-    pair = None if left is None or right is None else (left, right)
-    calibration = attempt(
-        "calibration_file",
-        "P2 and P3, 12 finite numbers each, or rig.json as in docs/inputs.md",
-        files.read_calibration,
-    )
+    if left is not None and right is not None:
+        pair = attempt("image_size", "one size", lambda: as_pair(left, right, files.right))
+    calibrated = "P2 and P3, 12 finite numbers each, or rig.json as in docs/inputs.md"
+    calibration = attempt("calibration_file", calibrated, files.read_calibration)
     if pair is not None and calibration is not None:
-        try:
-            calibration.check_size((pair[0].shape[1], pair[0].shape[0]))
-        except DataFormatError as error:
-            findings.append(_unreadable("image_size", frame_id, "the size that the calibration is of", error))
+        size_wh, of_calibration = (pair[0].shape[1], pair[0].shape[0]), "the size that the calibration is of"
+        if attempt("image_size", of_calibration, lambda: calibration.of_size(size_wh)) is None:
             pair = None  # what rests on both would only say the same again
     objects = attempt("detection_file", "lines of 15 or 16 columns, or JSON as in docs/inputs.md", files.read_objects)
-    masks = None
-    if dataset.masks is not None and pair is not None:
-        source, size_hw = dataset.masks, (pair[0].shape[0], pair[0].shape[1])
-        masks = attempt("mask_file", "masks of both images", lambda: source.read(frame_id, size_hw))
-    attempt("plane_file", "a x + b y + c z + d = 0 with |b| near 1", files.read_plane)
     refined = [o for o in objects or [] if o.type in dataset.classes and o.has_box_3d]
     parts = FrameParts(frame_id, pair, calibration, _camera(calibration), refined, masks)
-    return parts, findings
+    source, size_hw = dataset.masks, parts.size_hw
+    if source is not None and size_hw is not None:
+        masks = attempt("mask_file", "masks of both images", lambda: source.read(frame_id, size_hw))
+    attempt("plane_file", "a x + b y + c z + d = 0 with |b| near 1", files.read_plane)
+    return replace(parts, masks=masks), findings
 
 
 def numbers_of(calibration: KittiCalibration) -> tuple[dict[str, NDArray[np.float64]], float]:
@@ -140,20 +134,3 @@ def _camera(calibration: KittiCalibration | None) -> StereoCamera | None:
         return None if calibration is None else to_stereo_camera(calibration)
     except (DirectShapeError, RuntimeError):  # a singular matrix is a RuntimeError
         return None
-
-
-def _unreadable(check: str, frame_id: str, expected: str, error: Exception) -> Finding:
-    if isinstance(error, MaskSizeError):
-        check, expected = "mask_size", "masks of the size of their image"
-    return unreadable(check, f"frame {frame_id}", expected, error, "check the path and the file")
-
-
-def _other_size(frame_id: str, left: tuple[int, ...], right: tuple[int, ...]) -> Finding:
-    return Finding(
-        "image_size",
-        "error",
-        f"frame {frame_id}",
-        f"left {left[1]} x {left[0]}, right {right[1]} x {right[0]} pixels",
-        "one size",
-        "give the rectified pair of one frame, both images cut and scaled alike",
-    )

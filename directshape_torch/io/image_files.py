@@ -38,7 +38,13 @@ def read_rgb(path: Path | str) -> NDArray[np.uint8]:
 
 def read_pair(left_path: Path, right_path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Both images of a rectified pair, see `read_rgb`."""
-    left, right = read_rgb(left_path), read_rgb(right_path)
+    return as_pair(read_rgb(left_path), read_rgb(right_path), right_path)
+
+
+def as_pair(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], right_path: Path
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Both images, unless they differ in size."""
     if left.shape != right.shape:
         raise DataFormatError(
             right_path,

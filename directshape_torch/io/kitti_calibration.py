@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -45,12 +45,13 @@ class KittiCalibration:
     Tr_velo_to_cam: NDArray[np.float64] | None = None  # LiDAR to camera 0, (3, 4), metres, or None
     size_wh: tuple[int, int] | None = None  # of the images, where the file says
 
-    def check_size(self, size_wh: tuple[int, int]) -> None:
-        """Raise `DataFormatError` where the file says that images are of another size."""
+    def of_size(self, size_wh: tuple[int, int]) -> Self:
+        """The calibration itself; raises `DataFormatError` where the file says that images are of another size."""
         if self.size_wh not in (None, size_wh):
             said, got = (" x ".join(map(str, size)) for size in (self.size_wh or (), size_wh))
             problem = f"is of images of {said} pixels, they have {got}"
             raise DataFormatError(self.path, problem, cure="give size and intrinsics of the images as they are")
+        return self
 
 
 def read_calibration(path: Path | str) -> KittiCalibration:
@@ -100,8 +101,7 @@ def camera_of_rig(
     dtype: torch.dtype = torch.float32,
 ) -> StereoCamera:
     """The stereo camera of a frame, with the first of some disparity fields that is of its rig, if there are any."""
-    calibration.check_size(size_wh)
-    rig = to_stereo_camera(calibration)
+    rig = to_stereo_camera(calibration.of_size(size_wh))
     refusal: InputError | None = None
     for field in fields:
         try:
