@@ -25,9 +25,8 @@ from directshape_torch.io.instance_masks import (
     InstanceMask,
     Side,
     check_count,
-    decode_segmentation,
     instance_of,
-    read_soft_mask,
+    read_mask,
 )
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera, upright_plane
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
@@ -214,10 +213,7 @@ def masks_of(path: Path, root: Path, size_hw: tuple[int, int]) -> list[InstanceM
         for row, entry in enumerate(objects):
             if (mask := _mask_of(entry, side)) is None:
                 continue
-            if isinstance(mask, str):
-                probability: Any = read_soft_mask(root / mask, size_hw)
-            else:
-                probability = decode_segmentation(path, f"mask_{side} of objects[{row}]", mask, size_hw)
+            probability = read_mask(path, f"mask_{side} of objects[{row}]", mask, size_hw, root)
             box, is_car = entry.box_2d if side == "left" else None, entry.object_class == _CAR
             found.append(instance_of(side, row, probability, is_car=is_car, box=box, score=entry.score, row=row))
     return [mask for mask in found if mask is not None]

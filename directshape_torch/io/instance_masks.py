@@ -96,15 +96,23 @@ def tight_box(probability: NDArray[Any]) -> tuple[float, float, float, float] | 
     return float(columns[0]), float(rows[0]), float(columns[-1]), float(rows[-1])
 
 
-def read_soft_mask(path: Path, size_hw: tuple[int, int]) -> NDArray[np.float32]:
-    """A PNG of foreground probability x 255 (or x 65535, with 16 bits), (H, W) in [0, 1].
+def read_mask(path: Path, where: str, mask: Any, size_hw: tuple[int, int], root: Path) -> NDArray[Any]:
+    """A mask (H, W) as a file says it, bool or foreground probability in [0, 1].
+
+    Args:
+        path, where: the file and the place in it, named in errors.
+        mask: the path, from `root`, of a PNG of probability x 255 (or x 65535, with 16 bits), or a COCO segmentation.
+        size_hw: size of the image.
+        root: a folder.
 
     Raises:
-        DataFormatError: it is missing, damaged, or has several channels.
+        DataFormatError: the PNG is missing, damaged, or has several channels; or as `decode_segmentation`.
         MaskSizeError: it has another size than its image.
     """
-    grey = read_single_channel(path)
-    check_size(path, "the soft mask", grey.shape, size_hw)
+    if not isinstance(mask, str):
+        return decode_segmentation(path, where, mask, size_hw)
+    grey = read_single_channel(root / mask)
+    check_size(root / mask, "the soft mask", grey.shape, size_hw)
     return np.asarray(grey.astype(np.float32) / np.float32(np.iinfo(grey.dtype).max))
 
 

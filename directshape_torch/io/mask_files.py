@@ -21,10 +21,9 @@ from directshape_torch.io.instance_masks import (
     Side,
     check_count,
     check_size,
-    decode_segmentation,
     file_of_frame,
     instance_of,
-    read_soft_mask,
+    read_mask,
     tight_box,
 )
 
@@ -214,10 +213,8 @@ def _from_coco(
         side = of_side or entry.get("image")
         if side not in SIDES:
             raise DataFormatError(path, f"entry {index}: 'image' is {shown(side)}, expected 'left' or 'right'")
-        if soft := entry.get("soft_probability"):
-            probability: Any = read_soft_mask(path.parent / str(soft), size_hw)
-        else:
-            probability = decode_segmentation(path, f"entry {index}", entry.get("segmentation"), size_hw)
+        mask = entry.get("soft_probability") or entry.get("segmentation")
+        probability = read_mask(path, f"entry {index}", mask, size_hw, path.parent)
         if tight_box(probability) is None:  # whatever else its entry says
             continue
         try:
