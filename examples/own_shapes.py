@@ -20,7 +20,7 @@ from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
 from directshape_torch.shape.pca_fit import fit_pca
-from directshape_torch.shape.pca_prior import PriorProvenance
+from directshape_torch.shape.prior_file import PriorProvenance
 from directshape_torch.shape.zero_level import sdf_to_mesh
 
 ROOT = Path(directshape_torch.__file__).parent / "assets" / "demo"
@@ -52,11 +52,11 @@ def main(out_dir: Path, meshes: Path | None = None) -> RefinementResult:
     prior = build(meshes)
     shares = ", ".join(f"{share:.0%}" for share in prior.explained_variance_ratio.tolist())
     print(f"{prior.provenance.num_samples} meshes, variance explained by each component: {shares}")
-    prior.save(out_dir / "own_prior.npz")
+    prior.save(out_dir / "own_prior.safetensors")
 
     dataset = open_dataset("kitti", ROOT, ROOT / "detections" / "noisy_stereo", ROOT / "training" / "masks")
     loaded = dataset.load("000000")
-    result = DirectShapeRefiner(prior=load_prior(out_dir / "own_prior.npz"))(loaded.frame, loaded.detections)
+    result = DirectShapeRefiner(prior=load_prior(out_dir / "own_prior.safetensors"))(loaded.frame, loaded.detections)
     for car, status in enumerate(result.status):
         print(f"car {car}: {status.name}, code {', '.join(f'{z:+.1f}' for z in result.code[car].tolist())}")
     return result

@@ -1,4 +1,4 @@
-"""Make `directshape_torch/assets/car_prior.npz`: principal components of a few hundred parametric cars.
+"""Make `directshape_torch/assets/car_prior.safetensors`: principal components of a few hundred parametric cars.
 
     python scripts/build_bundled_prior.py [--num-cars 600 --num-codes 8 --out PATH]
     python scripts/build_bundled_prior.py --kernel 32 --out kernel_prior.safetensors
@@ -24,7 +24,7 @@ from tqdm import tqdm
 from directshape_torch.shape.kernel_pca_prior import KernelPCAShapePrior
 from directshape_torch.shape.mesh_to_sdf import GridSpec
 from directshape_torch.shape.pca_fit import fit_pca
-from directshape_torch.shape.pca_prior import PriorProvenance
+from directshape_torch.shape.prior_file import PriorProvenance
 
 GRID = GridSpec.for_cars(spacing_m=0.1)
 
@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--num-codes", type=int, default=8)
     parser.add_argument("--kernel", type=int, metavar="M", help="a kernel PCA over M linear components, for --out")
-    bundled = Path(__file__).parents[1] / "directshape_torch" / "assets" / "car_prior.npz"
+    bundled = Path(__file__).parents[1] / "directshape_torch" / "assets" / "car_prior.safetensors"
     parser.add_argument("--out", type=Path, default=bundled)
     args = parser.parse_args()
     if args.kernel and args.out == bundled:
@@ -60,7 +60,7 @@ def main() -> None:
         KernelPCAShapePrior.fit(*cars, num_components=args.kernel).save(args.out)
         return
     prior = fit_pca(*cars)
-    prior.save(args.out, grid_dtype="float16")
+    prior.save(args.out, torch.float16)
     mean, std = prior.dimensions_mean_hwl.tolist(), prior.dimensions_std_hwl.tolist()
     print("height, width, length, m: " + ", ".join(f"{m:.2f} +- {s:.2f}" for m, s in zip(mean, std, strict=True)))
     shares = ", ".join(f"{share:.3f}" for share in prior.explained_variance_ratio.tolist())

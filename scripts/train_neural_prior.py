@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from directshape_torch.shape.neural_prior import NeuralShapePrior
 from directshape_torch.shape.pca_fit import training_codes
-from directshape_torch.shape.pca_prior import PriorProvenance
+from directshape_torch.shape.prior_file import PriorProvenance
 from directshape_torch.shape.zero_level import zero_level_extents
 
 Array = NDArray[np.float64]

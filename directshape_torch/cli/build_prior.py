@@ -19,7 +19,8 @@ from directshape_torch.files import atomic_files
 from directshape_torch.files.mesh_files import MESH_SUFFIXES
 from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
 from directshape_torch.shape.pca_fit import fit_pca
-from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.prior_file import PriorProvenance
 from directshape_torch.shape.prior_quality import leave_one_out_errors_cm
 
 REPORT_SCHEMA = "directshape_torch.prior_report/1"
@@ -30,7 +31,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--meshes", type=Path, required=True, help="folder of obj, ply, glb, off or stl files, searched deep"
     )
-    parser.add_argument("--out", type=Path, required=True, help="npz file to write")
+    parser.add_argument("--out", type=Path, required=True, help="safetensors file to write")
     parser.add_argument("--pattern", default="**/*", help="which files below the folder (default: %(default)s)")
     parser.add_argument("--num-codes", type=int, default=8, help="components to keep (default: %(default)s)")
     parser.add_argument("--spacing", type=float, default=0.1, metavar="M", help="grid spacing (default: %(default)s)")

@@ -8,20 +8,19 @@ differs: it depends on the code.
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import check_shape
 from directshape_torch.shape.pca_fit import fit_pca, training_codes
-from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.prior_file import PriorProvenance, read_prior, write_prior
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivatives
-from directshape_torch.shape.tensor_file import read_tensors, write_tensors
 
 _CURE = "make one with: python scripts/build_bundled_prior.py --kernel 32 --out FILE"
 # Of the Gaussian kernel between cars, in units of their root mean square distance.
@@ -178,25 +177,18 @@ class KernelPCAShapePrior(nn.Module):
         """Write a safetensors file, atomically; the grids in float16, which rounds by less than 1 mm near surfaces."""
         tensors = dict(self.named_buffers())
         tensors |= {name: tensors[name].to(torch.float16) for name in _GRIDS}
-        description = {"schema": self.SCHEMA, "spacing_m": self.spacing_m, "provenance": asdict(self.provenance)}
-        write_tensors(Path(path), tensors, description)
+        write_prior(path, self.SCHEMA, self.provenance, tensors, spacing_m=self.spacing_m)
 
     @classmethod
     def load(cls, path: Path | str) -> KernelPCAShapePrior:
-        """Read a file of `save`, float32 on the CPU.
+        """Read a file of `save`, float32 on the CPU; raises as `PCAShapePrior.load`."""
 
-        Raises:
-            DataFormatError: not such a file, truncated, another schema, or tensors that do not fit together.
-        """
-        path = Path(path)
-        tensors, description = read_tensors(path, cls.SCHEMA, _CURE)
-        of_subspace = {name.removeprefix("subspace."): tensors.pop(name) for name in list(tensors) if "." in name}
-        try:
-            made = PriorProvenance(**description["provenance"])
-            subspace = PCAShapePrior(spacing_m=float(description["spacing_m"]), provenance=made, **of_subspace)
+        def make(tensors: dict[str, Tensor], made: PriorProvenance, settings: dict[str, Any]) -> KernelPCAShapePrior:
+            of_subspace = {name.removeprefix("subspace."): tensors.pop(name) for name in list(tensors) if "." in name}
+            subspace = PCAShapePrior(spacing_m=float(settings["spacing_m"]), provenance=made, **of_subspace)
             return cls(subspace, **tensors)
-        except (InputError, KeyError, TypeError, ValueError) as problem:
-            raise DataFormatError(path, f"not a valid kernel PCA prior: {problem!r}", cure=_CURE) from problem
+
+        return read_prior(path, cls.SCHEMA, _CURE, make)
 
 
 class CurvedGridShape:

@@ -11,8 +11,8 @@ from directshape_torch.numerics.checks import check_type
 from directshape_torch.shape.kernel_pca_prior import KernelPCAShapePrior
 from directshape_torch.shape.neural_prior import NeuralShapePrior
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.prior_file import read_description
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.shape.tensor_file import read_description
 
 BUNDLED_PRIORS: Mapping[str, Callable[[], ShapePrior]] = {
     "pca": PCAShapePrior.load_bundled,
@@ -21,6 +21,7 @@ BUNDLED_PRIORS: Mapping[str, Callable[[], ShapePrior]] = {
 """The priors that come with the package, by the name that `load_prior` knows them by."""
 
 _READERS: Mapping[str, Callable[[Path], ShapePrior]] = {
+    PCAShapePrior.SCHEMA: PCAShapePrior.load,
     NeuralShapePrior.SCHEMA: NeuralShapePrior.load,
     KernelPCAShapePrior.SCHEMA: KernelPCAShapePrior.load,
 }
@@ -44,8 +45,6 @@ def load_prior(source: Path | str) -> ShapePrior:
     if bundled is not None:
         return bundled()
     path = Path(source)
-    if path.suffix != ".safetensors":
-        return PCAShapePrior.load(path)
     schema = read_description(path).get("schema", "none")
     reader = _READERS.get(schema) if isinstance(schema, str) else None
     if reader is None:

@@ -9,19 +9,17 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from directshape_torch.errors import DataFormatError, InputError, shown
+from directshape_torch.errors import InputError, shown
 from directshape_torch.numerics.checks import check_shape
 from directshape_torch.numerics.tensors import constant_like
-from directshape_torch.shape.pca_prior import PriorProvenance
+from directshape_torch.shape.prior_file import PriorProvenance, read_prior, write_prior
 from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivatives
-from directshape_torch.shape.tensor_file import read_tensors, write_tensors
 
 # Half width of the zone about the middle plane where the mirrored coordinate `sqrt(z^2 + s^2)` is rounded.
 MIRROR_ROUNDING_M = 0.2
@@ -146,38 +144,27 @@ class NeuralShapePrior(nn.Module):
 
     def save(self, path: Path | str) -> None:
         """Write a safetensors file, atomically."""
-        description = {
-            "schema": self.SCHEMA,
-            "layer_widths": self.layer_widths,
-            "num_codes": self.num_codes,
-            "grid_shape": self.grid_shape,
-            "spacing_m": self.spacing_m,
-            "provenance": asdict(self.provenance),
-        }
-        write_tensors(Path(path), {**dict(self.named_parameters()), **dict(self.named_buffers())}, description)
+        names = ("layer_widths", "num_codes", "grid_shape", "spacing_m")
+        settings = {name: getattr(self, name) for name in names}
+        tensors = {**dict(self.named_parameters()), **dict(self.named_buffers())}
+        write_prior(path, self.SCHEMA, self.provenance, tensors, **settings)
 
     @classmethod
     def load(cls, path: Path | str) -> NeuralShapePrior:
-        """Read a file of `save`, float32 on the CPU.
+        """Read a file of `save`, float32 on the CPU; raises as `PCAShapePrior.load`."""
 
-        Raises:
-            DataFormatError: not such a file, truncated, another schema, or tensors that do not fit together.
-        """
-        path = Path(path)
-        tensors, description = read_tensors(path, cls.SCHEMA, _CURE)
-        try:
-            settings = {name: description[name] for name in ("layer_widths", "num_codes", "spacing_m")}
-            nx, ny, nz = description["grid_shape"]
-            if len(settings["layer_widths"]) > len(tensors) or math.prod((nx, ny, nz)) > _MOST_NODES:
+        def make(tensors: dict[str, Tensor], made: PriorProvenance, settings: dict[str, Any]) -> NeuralShapePrior:
+            widths, (nx, ny, nz) = settings["layer_widths"], settings["grid_shape"]
+            if len(widths) > len(tensors) or math.prod((nx, ny, nz)) > _MOST_NODES:
                 raise ValueError(f"more layers than tensors, or more than {_MOST_NODES} nodes")
-            made = PriorProvenance(**description["provenance"])
             # Without memory and random numbers until it is filled: the sizes are those that somebody has written down.
             with torch.device("meta"):
-                prior = cls(origin=torch.zeros(3), grid_shape=(nx, ny, nz), provenance=made, **settings)
+                origin = torch.zeros(3)
+                prior = cls(widths, settings["num_codes"], origin, (nx, ny, nz), settings["spacing_m"], made)
             prior.load_state_dict(tensors, assign=True)
-        except (InputError, KeyError, TypeError, ValueError, RuntimeError) as problem:
-            raise DataFormatError(path, f"it describes no neural prior: {problem}", cure=_CURE) from problem
-        return prior
+            return prior
+
+        return read_prior(path, cls.SCHEMA, _CURE, make)
 
     @classmethod
     def load_bundled(cls) -> NeuralShapePrior:

@@ -7,7 +7,8 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import check_positive, check_shape, check_type
-from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.prior_file import PriorProvenance
 from directshape_torch.shape.zero_level import zero_level_extents
 
 # Spread of the weight of grid nodes about the samples' surfaces.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -11,18 +11,11 @@ from torch import Tensor, nn
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import check_alike, check_finite, check_positive, check_shape
 from directshape_torch.numerics.tensors import constant_like
+from directshape_torch.shape.prior_file import PriorProvenance, read_prior, write_prior
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import DimensionsDerivative
 
-
-@dataclass(frozen=True)
-class PriorProvenance:
-    """Where a prior comes from: kept inside its file."""
-
-    made_by: str
-    licence: str
-    num_samples: int
-    remarks: str = ""
+_CURE = "make one with: directshape build-prior"
 
 
 class PCAShapePrior(nn.Module):
@@ -49,6 +42,8 @@ class PCAShapePrior(nn.Module):
         >>> prior.values(code).shape[0], prior.bind(code).value(torch.zeros(1, 3), torch.tensor([1])).shape
         (2, torch.Size([1]))
     """
+
+    SCHEMA: ClassVar = "directshape_torch.pca_shape_prior/2"
 
     mean: Tensor
     basis: Tensor
@@ -128,27 +123,29 @@ class PCAShapePrior(nn.Module):
         """`dimensions_hwl` with its constant derivative, (B, 3) and (B, 3, K)."""
         return DimensionsDerivative(self.dimensions_hwl(code), self.dimensions_basis_hwl.expand(len(code), -1, -1))
 
-    def save(self, path: Path | str, grid_dtype: str = "float32") -> None:
-        """Write an npz file, atomically; `grid_dtype="float16"` halves it (rounding below 1 mm near the surface)."""
-        from directshape_torch.shape.prior_file import write_prior
-
-        write_prior(self, Path(path), grid_dtype)
+    def save(self, path: Path | str, grid_dtype: torch.dtype = torch.float32) -> None:
+        """Write a safetensors file, atomically; grids in `torch.float16` halve it and round by less than 1 mm."""
+        tensors = {name: tensor.to(torch.float32) for name, tensor in self.named_buffers()}
+        tensors |= {name: tensors[name].to(grid_dtype) for name in ("mean", "basis")}
+        write_prior(path, self.SCHEMA, self.provenance, tensors, spacing_m=self.spacing_m)
 
     @classmethod
     def load(cls, path: Path | str) -> PCAShapePrior:
         """Read a file of `save`, float32 on the CPU.
 
         Raises:
-            DataFormatError: not such a file, another schema, or arrays that do not fit together.
+            DataFormatError: not such a file, truncated, another schema, or tensors that do not fit together.
         """
-        from directshape_torch.shape.prior_file import read_prior
 
-        return read_prior(Path(path))
+        def make(tensors: dict[str, Tensor], provenance: PriorProvenance, settings: dict[str, Any]) -> PCAShapePrior:
+            return cls(spacing_m=float(settings["spacing_m"]), provenance=provenance, **tensors)
+
+        return read_prior(path, cls.SCHEMA, _CURE, make)
 
     @classmethod
     def load_bundled(cls) -> PCAShapePrior:
         """The passenger cars that come with the package (of parametric cars; licence of this project)."""
-        return cls.load(Path(__file__).parents[1] / "assets" / "car_prior.npz")
+        return cls.load(Path(__file__).parents[1] / "assets" / "car_prior.safetensors")
 
     def get_extra_state(self) -> Tensor:
         return torch.tensor(self.spacing_m, dtype=torch.float64)

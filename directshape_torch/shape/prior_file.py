@@ -1,71 +1,108 @@
-"""The npz file of a PCA shape prior: plain arrays and JSON text, no pickle, written atomically."""
+"""Files of shape priors: named tensors with a description in safetensors, which hold no code and cannot run any."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
+from torch import Tensor
 
-from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.files.atomic_files import replaced_file
-from directshape_torch.files.read_files import parse_json, read_npz
-from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
+from directshape_torch.errors import DataFormatError, InputError, shown
+from directshape_torch.files.atomic_files import write_bytes
+from directshape_torch.files.read_files import parse_json, read_bytes
 
-SCHEMA = "directshape_torch.pca_shape_prior/1"
-_CURE = "make one with: directshape build-prior"
-_GRIDS = ("mean", "basis")
-_VECTORS = (
-    "origin",
-    "explained_variance_ratio",
-    "dimensions_mean_hwl",
-    "dimensions_basis_hwl",
-    "dimensions_std_hwl",
-)
+# One key with JSON text, because the order of several keys in the file is not fixed.
+_KEY = "description"
+_MOST_BYTES = 2**29
+_NOT_WHOLE = "not a whole safetensors file"
+_PriorT = TypeVar("_PriorT")
 
 
-def write_prior(prior: PCAShapePrior, path: Path, grid_dtype: str = "float32") -> None:
-    """Write a prior; a reader never sees a half-written file.
+@dataclass(frozen=True)
+class PriorProvenance:
+    """Where a prior comes from: kept inside its file."""
+
+    made_by: str
+    licence: str
+    num_samples: int
+    remarks: str = ""
+
+
+def write_prior(
+    path: Path | str, schema: str, provenance: PriorProvenance, tensors: Mapping[str, Tensor], **settings: Any
+) -> None:
+    """Write a prior, atomically; the same content gives the same bytes."""
+    from safetensors.torch import save
+
+    description = {"schema": schema, "provenance": asdict(provenance), **settings}
+    on_cpu = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    write_bytes(Path(path), save(on_cpu, {_KEY: json.dumps(description, sort_keys=True)}))
+
+
+def read_prior(
+    path: Path | str,
+    schema: str,
+    cure: str,
+    make: Callable[[dict[str, Tensor], PriorProvenance, dict[str, Any]], _PriorT],
+) -> _PriorT:
+    """The prior that `make` makes of tensors, float32 on the CPU, of the provenance and of the settings in a file.
 
     Raises:
-        InputError: `grid_dtype` is not float16, float32 or float64.
+        DataFormatError: missing, truncated, of another schema, with values that are not finite numbers, or with
+            tensors and settings that do not fit together.
     """
-    if grid_dtype not in ("float16", "float32", "float64"):
-        raise InputError("grid_dtype", "float16, float32 or float64", repr(grid_dtype))
-    arrays = {name: getattr(prior, name).cpu().numpy().astype(grid_dtype) for name in _GRIDS}
-    arrays |= {name: getattr(prior, name).cpu().numpy().astype(np.float64) for name in _VECTORS}
-    arrays["spacing_m"] = np.float64(prior.spacing_m)
-    arrays["schema"] = np.array(SCHEMA)
-    arrays["provenance"] = np.array(json.dumps(asdict(prior.provenance)))
-    with replaced_file(path) as file:
-        np.savez_compressed(file, **arrays)
-
-
-def read_prior(path: Path) -> PCAShapePrior:
-    """Read a prior, float32 on the CPU.
-
-    Raises:
-        DataFormatError: missing, unreadable, of another schema, or with arrays that do not fit together.
-    """
-    arrays = read_npz(path, _CURE)
-    schema = str(arrays["schema"]) if "schema" in arrays else "none"
-    if schema != SCHEMA:
-        raise DataFormatError(path, f"schema {schema!r} is not {SCHEMA!r}", cure=_CURE)
-    missing = [name for name in (*_GRIDS, *_VECTORS, "spacing_m", "provenance") if name not in arrays]
-    if missing:
-        raise DataFormatError(path, f"lacks the arrays {', '.join(missing)}")
-    tensors = {name: _finite_tensor(path, name, arrays[name]) for name in (*_GRIDS, *_VECTORS)}
+    tensors, description = _read_tensors(Path(path), schema, cure)
     try:
-        provenance = PriorProvenance(**parse_json(path, str(arrays["provenance"])))
-        return PCAShapePrior(spacing_m=float(arrays["spacing_m"]), provenance=provenance, **tensors)
-    except (InputError, TypeError, ValueError) as problem:
-        raise DataFormatError(path, f"not a valid shape prior: {problem}") from problem
+        return make(tensors, PriorProvenance(**description["provenance"]), description)
+    except (InputError, KeyError, TypeError, ValueError, RuntimeError) as problem:
+        raise DataFormatError(path, f"it describes no shape prior: {problem!r}", cure=cure) from problem
 
 
-def _finite_tensor(path: Path, name: str, array: NDArray[np.generic]) -> torch.Tensor:
-    if not np.issubdtype(array.dtype, np.floating) or not np.isfinite(array).all():
-        raise DataFormatError(path, f"{name} holds values that are no finite floating-point numbers")
-    return torch.from_numpy(array.astype(np.float32))
+def read_description(path: Path, cure: str = "") -> dict[str, Any]:
+    """The description in a safetensors file; empty where it has none.
+
+    Raises:
+        DataFormatError: no such file, or no safetensors file, or a truncated one.
+    """
+    return _description(path, _read(path, cure), cure)
+
+
+def _read_tensors(path: Path, schema: str, cure: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    content = _read(path, cure)
+    description = _description(path, content, cure)
+    found = description.get("schema", "none")
+    if found != schema:
+        raise DataFormatError(path, f"schema {shown(found)} is not {schema!r}", cure=cure)
+    try:
+        tensors = {name: (tensor.is_floating_point(), tensor.float()) for name, tensor in load(content).items()}
+    except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as problem:
+        raise DataFormatError(path, f"{_NOT_WHOLE} ({problem})", cure=cure) from problem
+    for name, (is_floating, tensor) in tensors.items():
+        if not is_floating or not bool(torch.isfinite(tensor).all()):
+            raise DataFormatError(path, f"{name} holds values that are no finite floating-point numbers")
+    return {name: tensor for name, (_, tensor) in tensors.items()}, description
+
+
+def _read(path: Path, cure: str) -> bytes:
+    return read_bytes(path, _MOST_BYTES, cure)
+
+
+def _description(path: Path, content: bytes, cure: str) -> dict[str, Any]:
+    """Of the header: eight bytes of its length, then JSON."""
+    end = 8 + int.from_bytes(content[:8], "little")
+    header = parse_json(path, content[8:end], cure, _NOT_WHOLE)
+    metadata = header.get("__metadata__", {}) if isinstance(header, dict) and end <= len(content) else None
+    text = metadata.get(_KEY, "{}") if isinstance(metadata, dict) else None
+    if not isinstance(text, str):
+        raise DataFormatError(path, _NOT_WHOLE, cure=cure)
+    description = parse_json(path, text, cure)
+    if not isinstance(description, dict):
+        raise DataFormatError(path, f"a description that is no JSON object: {shown(description)}", cure=cure)
+    return description

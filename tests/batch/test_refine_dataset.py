@@ -148,7 +148,9 @@ def test_a_long_run_compiles_from_its_first_frame_and_a_short_one_never(
 
     monkeypatch.setattr("directshape_torch.batch.refine_dataset.expected_cars", lambda *_: 5000)
     # The number is what counts here; compiling for it would take minutes.
-    watched = Watched(PCAShapePrior.load(kitti_copy / "prior.npz"), load_config(None, [*FEW_STEPS, "compile=off"]))
+    watched = Watched(
+        PCAShapePrior.load(kitti_copy / "prior.safetensors"), load_config(None, [*FEW_STEPS, "compile=off"])
+    )
     refine(kitti_copy, tmp_path, watched)
     # The same for every call: neither the calls before nor an interruption change what is compiled.
     assert counts == [5000, 5000]

@@ -84,7 +84,7 @@ def test_another_setting_is_named_and_nothing_is_written(shared_kitti: Path, tmp
 
 def test_another_prior_or_input_is_named(kitti_copy: Path, tmp_path: Path) -> None:
     refine(kitti_copy, tmp_path / "out")
-    prior = PCAShapePrior.load(kitti_copy / "prior.npz")
+    prior = PCAShapePrior.load(kitti_copy / "prior.safetensors")
     prior.mean += 0.001
     with pytest.raises(ResumeError, match="sha256 of 'prior'"):
         refine(kitti_copy, tmp_path / "out", DirectShapeRefiner(prior, load_config(None, FEW_STEPS)))

@@ -29,7 +29,7 @@ OPTIONS = ("--up-axis=-y", "--num-codes", "1", "--spacing", "0.2", "--voxel", "0
 
 
 def test_writes_prior_and_report(meshes, tmp_path, capsys):
-    out = tmp_path / "made" / "car.npz"
+    out = tmp_path / "made" / "car.safetensors"
     assert run("--meshes", str(meshes), "--out", str(out), *OPTIONS) == 0
     prior = PCAShapePrior.load(out)
     assert prior.num_codes == 1
@@ -41,7 +41,7 @@ def test_writes_prior_and_report(meshes, tmp_path, capsys):
     lengths = [sample_car(seed).length for seed in range(3)]
     assert report["mean_height_width_length_m"][2] == pytest.approx(sum(lengths) / 3, abs=0.1)
     assert "leave-one-out error" in capsys.readouterr().out
-    assert sorted(f.name for f in out.parent.iterdir()) == ["car.json", "car.npz"]
+    assert sorted(f.name for f in out.parent.iterdir()) == ["car.json", "car.safetensors"]
 
 
 def test_skips_a_mesh_that_is_no_solid_and_says_so(meshes, tmp_path, capsys):
@@ -50,5 +50,5 @@ def test_skips_a_mesh_that_is_no_solid_and_says_so(meshes, tmp_path, capsys):
     for file in meshes.iterdir():
         (folder / file.name).write_bytes(file.read_bytes())
     (folder / "broken.obj").write_text("v 0 0 0\n")
-    assert run("--meshes", str(folder), "--out", str(tmp_path / "car.npz"), *OPTIONS) == 3
+    assert run("--meshes", str(folder), "--out", str(tmp_path / "car.safetensors"), *OPTIONS) == 3
     assert "skipped broken.obj" in capsys.readouterr().out

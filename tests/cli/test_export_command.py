@@ -14,7 +14,7 @@ from directshape_torch.cli.main import main
 
 
 def command(run: FinishedRun, out: Path, *words: str | Path) -> list[str]:
-    return [str(word) for word in ("export", run.out, "--prior", run.root / "prior.npz", "--out", out, *words)]
+    return [str(word) for word in ("export", run.out, "--prior", run.root / "prior.safetensors", "--out", out, *words)]
 
 
 def contents(folder: Path) -> dict[str, bytes]:

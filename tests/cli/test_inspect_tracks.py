@@ -15,7 +15,16 @@ from directshape_torch.cli.main import main
 def command(kitti: Path, root: Path, *extra: str) -> list[str]:
     write_sequence(kitti, root, FRAMES, single=True)
     words = ["inspect", "--layout", "tracking", "--data", root, "--detections", kitti / "detections", "--tracks"]
-    words += ["--masks", kitti / "masks", "--prior", kitti / "prior.npz", "--config", "fast", "--out", root / "figures"]
+    words += [
+        "--masks",
+        kitti / "masks",
+        "--prior",
+        kitti / "prior.safetensors",
+        "--config",
+        "fast",
+        "--out",
+        root / "figures",
+    ]
     return [*map(str, words), *extra]
 
 

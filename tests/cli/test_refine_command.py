@@ -16,7 +16,17 @@ QUICK = ("--set", "stages=[{max_iterations: 2}]")
 
 
 def command(root: Path, out: Path, *extra: str, masks: bool = True) -> list[str]:
-    words = ["refine", "--data", root, "--detections", root / "detections", "--out", out, "--prior", root / "prior.npz"]
+    words = [
+        "refine",
+        "--data",
+        root,
+        "--detections",
+        root / "detections",
+        "--out",
+        out,
+        "--prior",
+        root / "prior.safetensors",
+    ]
     words += ["--masks", root / "masks"] if masks else []
     return [*map(str, words), "--device", "cpu", *QUICK, *extra]
 

@@ -36,7 +36,17 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def refine(root: Path, out: Path, *extra: str) -> int:
-    words = ["refine", "--data", root, "--detections", root / "detections", "--out", out, "--prior", root / "prior.npz"]
+    words = [
+        "refine",
+        "--data",
+        root,
+        "--detections",
+        root / "detections",
+        "--out",
+        out,
+        "--prior",
+        root / "prior.safetensors",
+    ]
     words += ["--masks", root / "masks", "--device", "cpu", *QUICK, *extra]
     return main([str(word) for word in words])
 

@@ -13,7 +13,12 @@ from directshape_torch.cli.main import main
 
 def inputs(finished: FinishedRun) -> list[str]:
     root = finished.root
-    options = {"data": root, "detections": root / "detections", "masks": root / "masks", "prior": root / "prior.npz"}
+    options = {
+        "data": root,
+        "detections": root / "detections",
+        "masks": root / "masks",
+        "prior": root / "prior.safetensors",
+    }
     return [word for name, path in options.items() for word in (f"--{name}", str(path))]
 
 

@@ -10,11 +10,11 @@ from helpers.finished_run import FinishedRun
 from directshape_torch.cli.demo import DEMO_FOLDER
 from directshape_torch.cli.main import main
 
-EXPORT = "export {run} --prior {root}/prior.npz --out {out}"
+EXPORT = "export {run} --prior {root}/prior.safetensors --out {out}"
 REPORT = "report {run} --html {out}/page.html"
 INSPECT = "inspect --out {out}"
-PRIOR = "build-prior --meshes {meshes} --out {out}/car.npz"
-REFINE = "refine --data {root} --detections {root}/detections --out {out} --prior {root}/prior.npz --device cpu"
+PRIOR = "build-prior --meshes {meshes} --out {out}/car.safetensors"
+REFINE = "refine --data {root} --detections {root}/detections --out {out} --prior {root}/prior.safetensors --device cpu"
 MASKED = f"{REFINE} --masks {{root}}/masks"
 
 CASES = [
@@ -44,7 +44,7 @@ CASES = [
     (f"{INSPECT} --data x --tracks --car 1", "all cars of several frames, got --car 1 too"),
     (f"{INSPECT} --demo --prior nowhere.npz", "nowhere.npz"),
     (f"{INSPECT} --demo --car 2 --set sampling.min_usable_pixels=100000", "too_few_pixels"),
-    ("build-prior --meshes nowhere --out {out}/car.npz", "--meshes: expected a folder"),
+    ("build-prior --meshes nowhere --out {out}/car.safetensors", "--meshes: expected a folder"),
     (f"{PRIOR} --pattern *.glb", "none in"),
     (f"{PRIOR} --num-codes 9 --up-axis=-y --spacing 0.2", "more than --num-codes = 9 usable meshes"),
     (f"{PRIOR} --spacing 3", "--spacing"),

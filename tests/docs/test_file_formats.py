@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.kitti_folder import write_data_set
+from safetensors.torch import load_file
 
 from directshape_torch.cli.main import main
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.result_files import SHAPES_SCHEMA_VERSION
 from directshape_torch.io.run_manifest import MANIFEST_SCHEMA_VERSION
-from directshape_torch.shape.pca_prior import PriorProvenance
-from directshape_torch.shape.prior_file import SCHEMA as PRIOR_SCHEMA
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.prior_file import PriorProvenance, read_description
 from directshape_torch.status import Status
 
 TEXT = (Path(__file__).parent.parent.parent / "docs" / "file_formats.md").read_text(encoding="utf-8")
@@ -42,7 +43,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_data_set(root, ("000000", "000001"))
     (root / "training" / "image_2" / "000001.png").write_bytes(b"no image")
     words = ["refine", "--data", root, "--detections", root / "detections", "--masks", root / "masks", "--out", out]
-    options = ["--prior", root / "prior.npz", "--device", "cpu", "--set", "stages=[{max_iterations: 1}]"]
+    options = ["--prior", root / "prior.safetensors", "--device", "cpu", "--set", "stages=[{max_iterations: 1}]"]
     assert main([str(word) for word in (*words, *options)]) == 1
     return out
 
@@ -79,10 +80,10 @@ def test_timings(out: Path) -> None:
 
 def test_prior(tmp_path: Path) -> None:
     text = section("Shape prior")
-    assert PRIOR_SCHEMA in text
-    ellipsoid_prior().save(tmp_path / "prior.npz")
-    with np.load(tmp_path / "prior.npz", allow_pickle=False) as file:
-        assert table_names(text) == set(file.files)
+    assert PCAShapePrior.SCHEMA in text
+    ellipsoid_prior().save(tmp_path / "prior.safetensors")
+    description = read_description(tmp_path / "prior.safetensors")
+    assert table_names(text) == {*load_file(tmp_path / "prior.safetensors"), *description}
     for field in fields(PriorProvenance):
         assert f"`{field.name}`" in text
 

@@ -54,7 +54,7 @@ def test_the_python_example_runs(finished: FinishedRun, tmp_path: Path) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", TEXT[TEXT.index("## Export from Python") :], re.DOTALL)
     places = {
         '"OUT"': finished.out,
-        '"pca"': finished.root / "prior.npz",
+        '"pca"': finished.root / "prior.safetensors",
         '"ROOT"': finished.root,
         '"DETECTIONS"': finished.root / "detections",
         '"MASKS"': finished.root / "masks",

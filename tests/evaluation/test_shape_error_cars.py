@@ -62,7 +62,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     prior = write_data_set(root, FRAMES)
     write_truth(root, prior)
     words = ["refine", "--data", root, "--detections", root / "detections", "--masks", root / "masks"]
-    words += ["--out", root / "refined", "--prior", root / "prior.npz", "--device", "cpu", "--rig", "none"]
+    words += ["--out", root / "refined", "--prior", root / "prior.safetensors", "--device", "cpu", "--rig", "none"]
     assert main([*map(str, words), "--set", "stages=[{max_iterations: 1}]"]) == 0
     write_perfect(root / "refined", root / "perfect")
     return root
@@ -70,7 +70,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def evaluate(root: Path, refined: str = "perfect", **options: Any) -> ShapeScores:
     settings: dict[str, Any] = {"num_draws": 200, "masks": root / "masks"} | options
-    prior = load_prior(root / "prior.npz")
+    prior = load_prior(root / "prior.safetensors")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(matching, "_LEAST_HEIGHT_PX", 10.0)  # the second car is 18 px high
         return evaluate_shapes(root, root / "detections", root / refined, prior, **settings)
@@ -78,7 +78,7 @@ def evaluate(root: Path, refined: str = "perfect", **options: Any) -> ShapeScore
 
 def command(root: Path, refined: Path, *extra: str) -> list[str]:
     words = ["evaluate-shape", "--data", root, "--detections", root / "detections", "--refined", refined]
-    words += ["--masks", root / "masks", "--prior", root / "prior.npz", "--draws", 200]
+    words += ["--masks", root / "masks", "--prior", root / "prior.safetensors", "--draws", 200]
     return [*map(str, words), *extra]
 
 
@@ -191,7 +191,7 @@ def test_detections_of_another_run_are_named(root: Path, tmp_path: Path) -> None
     for frame_id in FRAMES:
         first = (root / "detections" / "data" / f"{frame_id}.txt").read_text().splitlines()[0]
         (tmp_path / f"{frame_id}.txt").write_text(first + "\n")
-    prior = load_prior(root / "prior.npz")
+    prior = load_prior(root / "prior.safetensors")
     with pytest.raises(DataFormatError, match="names line 3 of a detection file that has 1 lines"):
         evaluate_shapes(root, tmp_path, root / "perfect", prior, masks=root / "masks")
 

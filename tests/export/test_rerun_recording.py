@@ -73,7 +73,7 @@ class Recording:
 
 def refiner_of(run: FinishedRun) -> DirectShapeRefiner:
     config = config_from_mapping(RefinerConfig, run.folder().setting("refiner"))
-    return DirectShapeRefiner(PCAShapePrior.load(run.root / "prior.npz"), config)
+    return DirectShapeRefiner(PCAShapePrior.load(run.root / "prior.safetensors"), config)
 
 
 @pytest.fixture(scope="module")

@@ -120,7 +120,7 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
         "scan": (folder / "scan.bin", scan),
         "points": (folder / "points.npy", read_points),
         "network": (folder / "neural_prior.safetensors", load_prior),
-        "prior": (root / "prior.npz", load_prior),
+        "prior": (root / "prior.safetensors", load_prior),
         "boxes": (folder / "boxes.txt", read_boxes),
         "times": (folder / "times.txt", read_times),
         "poses": (folder / "poses.txt", read_poses),
@@ -193,7 +193,7 @@ def _runs(root: Path, out: Path) -> dict[str, Sample]:
     refine(root, out, overlays=True)
 
     def report() -> object:
-        return make_report(RunInputs(RunFolder(out), load_prior(root / "prior.npz")), out.parent / "page.html")
+        return make_report(RunInputs(RunFolder(out), load_prior(root / "prior.safetensors")), out.parent / "page.html")
 
     def resumed() -> object:
         return refine(root, out, overlays=True)

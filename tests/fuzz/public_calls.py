@@ -35,7 +35,7 @@ from directshape_torch.rig.detections import COLUMNS
 from directshape_torch.rig.rig_file import load_field
 from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.pca_fit import fit_pca
-from directshape_torch.shape.pca_prior import PriorProvenance
+from directshape_torch.shape.prior_file import PriorProvenance
 from directshape_torch.terms.lidar import LidarPoints
 
 QUICK = ("stages=[{contour_width_px: 0.5, image_level: 0, max_iterations: 1}]", "method=combined")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.prior_file import PriorProvenance
 from directshape_torch.shape.shape_prior import SdfDerivatives
 
 CENTRE_OBJ = (0.0, -0.75, 0.0)

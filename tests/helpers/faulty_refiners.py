@@ -31,7 +31,7 @@ class QuickRefiner(DirectShapeRefiner):
     """Two iterations, with the prior of a data set of `helpers.kitti_folder`."""
 
     def __init__(self, root: Path) -> None:
-        super().__init__(PCAShapePrior.load(root / "prior.npz"), few_steps())
+        super().__init__(PCAShapePrior.load(root / "prior.safetensors"), few_steps())
 
 
 class DeadlyRefiner(QuickRefiner):

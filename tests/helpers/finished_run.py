@@ -38,7 +38,7 @@ class FinishedRun:
 
     @property
     def prior(self) -> PCAShapePrior:
-        return PCAShapePrior.load(self.root / "prior.npz")
+        return PCAShapePrior.load(self.root / "prior.safetensors")
 
     @property
     def dataset(self) -> StereoDataset:
@@ -73,7 +73,7 @@ def refined(
     root: Path, out: Path, classes: tuple[str, ...] = ("Car",), meshes: MeshFormat | None = None
 ) -> FinishedRun:
     """Refine a data set, a few iterations a car."""
-    refiner = DirectShapeRefiner(PCAShapePrior.load(root / "prior.npz"), load_config(None, FEW_STEPS))
+    refiner = DirectShapeRefiner(PCAShapePrior.load(root / "prior.safetensors"), load_config(None, FEW_STEPS))
     refine_dataset(dataset_of(root, classes), refiner, out, RefineOptions(meshes=meshes))
     return FinishedRun(root, out)
 

@@ -22,9 +22,9 @@ CODE = ((0.8, -0.5, 0.6), (-0.7, 0.4, 0.5))
 
 
 def write_data_set(root: Path, frame_ids: tuple[str, ...] = FRAMES) -> PCAShapePrior:
-    """Frames with the same two cars and other detections in each; also `root/prior.npz` of the cars' shapes."""
+    """Frames with the same two cars and other detections in each; also `root/prior.safetensors` of the cars' shapes."""
     prior = ellipsoid_prior()
-    prior.save(root / "prior.npz", grid_dtype="float64")
+    prior.save(root / "prior.safetensors")
     scene = street(prior, *TWO_CARS, code=torch.tensor(CODE, dtype=prior.mean.dtype))
     for number, frame_id in enumerate(frame_ids):
         write_frame(root, frame_id, scene, disturbed(scene.detections, 0.4, 0.1, seed=number))

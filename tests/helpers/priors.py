@@ -8,7 +8,8 @@ import torch
 
 from directshape_torch.shape.kernel_pca_prior import KernelPCAShapePrior
 from directshape_torch.shape.neural_prior import NeuralShapePrior
-from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.prior_file import PriorProvenance
 from directshape_torch.shape.shape_prior import ShapePrior
 from helpers.ellipsoids import ellipsoid_prior
 

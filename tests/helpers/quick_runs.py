@@ -20,7 +20,7 @@ def dataset(root: Path, **options: Any) -> StereoDataset:
 
 
 def refiner(root: Path, config: RefinerConfig | None = None) -> DirectShapeRefiner:
-    return DirectShapeRefiner(PCAShapePrior.load(root / "prior.npz"), config or few_steps())
+    return DirectShapeRefiner(PCAShapePrior.load(root / "prior.safetensors"), config or few_steps())
 
 
 def refine(

@@ -72,7 +72,7 @@ def data_options(root: Path) -> list[str]:
 
 
 def refine_command(root: Path, out: Path) -> None:
-    prior = ["--prior", str(root / "prior.npz"), "--set", "solver.max_code=2"]
+    prior = ["--prior", str(root / "prior.safetensors"), "--set", "solver.max_code=2"]
     main(["refine", *data_options(root), "--out", str(out / "out"), *prior, "--frames", "000000"])
 
 
@@ -125,7 +125,7 @@ def commands(root: Path, out: Path) -> None:
     """What a run leaves, seen by all others."""
     run(root, out)
     data, labels, results = data_options(root), str(root / "training" / "label_2"), str(out / "out" / "data")
-    with_prior = [*data, "--prior", str(root / "prior.npz")]
+    with_prior = [*data, "--prior", str(root / "prior.safetensors")]
     for command in (
         ["status", str(out / "out")],
         ["report", str(out / "out"), "--html", str(out / "page.html"), *with_prior],

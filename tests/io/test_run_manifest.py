@@ -93,7 +93,7 @@ def test_what_all_frames_share_is_needed(tmp_path: Path, hashes: dict[str, str |
 def test_a_prior_has_the_same_hash_however_it_is_stored(tmp_path: Path) -> None:
     prior = ellipsoid_prior(torch.float32)
     prior.save(tmp_path / "first.npz")
-    prior.save(tmp_path / "second_name.npz", grid_dtype="float64")
+    prior.save(tmp_path / "second_name.safetensors")
     hashes = {hash_prior(PCAShapePrior.load(path)) for path in tmp_path.iterdir()}
     assert hashes == {hash_prior(prior)}
     prior.basis[0, 0, 0, 0] += 1e-3

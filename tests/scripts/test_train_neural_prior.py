@@ -10,7 +10,7 @@ import torch
 import train_neural_prior as script
 
 from directshape_torch.shape.neural_prior import NeuralShapePrior
-from directshape_torch.shape.pca_prior import PriorProvenance
+from directshape_torch.shape.prior_file import PriorProvenance
 
 MADE = PriorProvenance("a test", "Apache-2.0", 20)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from directshape_torch.errors import InputError
 from directshape_torch.shape.kernel_pca_prior import KernelPCAShapePrior
 from directshape_torch.shape.pca_fit import fit_pca, training_codes
-from directshape_torch.shape.pca_prior import PriorProvenance
+from directshape_torch.shape.prior_file import PriorProvenance
 
 MADE = PriorProvenance("a test", "Apache-2.0", 40)
 ORIGIN = torch.full((3,), -1.0, dtype=torch.float64)

@@ -9,7 +9,7 @@ import torch
 
 from directshape_torch.errors import InputError
 from directshape_torch.shape.neural_prior import MIRROR_ROUNDING_M, NeuralShapePrior
-from directshape_torch.shape.pca_prior import PriorProvenance
+from directshape_torch.shape.prior_file import PriorProvenance
 
 MADE = PriorProvenance("a test", "Apache-2.0", 1)
 ORIGIN = torch.tensor([-2.0, -2.0, -1.0], dtype=torch.float64)

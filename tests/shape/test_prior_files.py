@@ -29,7 +29,7 @@ MODULES: dict[str, Callable[[], nn.Module]] = {
 
 
 def write(kind: str, folder: Path) -> Path:
-    path = folder / ("prior.npz" if kind == "pca" else "prior.safetensors")
+    path = folder / "prior.safetensors"
     prior = prior_of(kind)
     assert isinstance(prior, nn.Module)
     prior.save(path)
@@ -62,7 +62,7 @@ def test_names_are_bundled_priors_and_paths_are_files(tmp_path: Path, monkeypatc
         load_prior(Path("neural"))
 
 
-@pytest.mark.parametrize("kind", ["neural", "kernel_pca"])
+@pytest.mark.parametrize("kind", MODULES)
 def test_wrong_files_say_what_is_wrong(kind: str, tmp_path: Path) -> None:
     good, bad = write(kind, tmp_path), tmp_path / "bad.safetensors"
     content = good.read_bytes()
@@ -79,7 +79,7 @@ def test_wrong_files_say_what_is_wrong(kind: str, tmp_path: Path) -> None:
 
     with pytest.raises(DataFormatError, match="schema 'other/9' is none of directshape_torch"):
         load_prior(changed(schema="other/9"))
-    with pytest.raises(DataFormatError, match=r"prior.*; make one with: python scripts/"):
+    with pytest.raises(DataFormatError, match=r"prior.*; make one with: (python scripts/|directshape build-prior)"):
         load_prior(changed(provenance={"made_at": "home"}))
     save_file(tensors, bad)
     with pytest.raises(DataFormatError, match="schema 'none' is none of"):

@@ -11,7 +11,8 @@ from directshape_torch.errors import InputError
 from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.mesh_to_sdf import GridSpec, load_mesh_obj, mesh_to_sdf
 from directshape_torch.shape.pca_fit import fit_pca
-from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.prior_file import PriorProvenance
 from directshape_torch.shape.prior_quality import NEAR_SURFACE_M, fit_car, grid_of, leave_one_out_errors_cm
 
 
