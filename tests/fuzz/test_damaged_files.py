@@ -16,7 +16,7 @@ from directshape_torch.errors import DirectShapeError, ResumeError
 FORMATS = (
     "tracking", "shapes", "disparity", "field", "rigs", "split", "points",
     "scan", "network", "prior", "boxes", "times", "poses", "mesh obj", "mesh ply", "mesh glb", "mesh off", "mesh stl",
-    "trust", "settings", "coco", "instances", "image", "calibration", "plane", "labels", "detections", "masks", "rig",
+    "settings", "coco", "instances", "image", "calibration", "plane", "labels", "detections", "masks", "rig",
     "frame", "raw calibration", "sequence calibration", "summary", "results", "report", "run",
     "results of a frame",
 )  # fmt: skip
