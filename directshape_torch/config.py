@@ -87,7 +87,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class StageConfig(Settings):
-    """One stage, coarse to fine: meanwhile pixels, counts and zeta are fixed, so that costs are comparable."""
+    """One stage of several, coarse to fine. Within a stage pixels, counts and zeta are fixed, so that costs compare."""
 
     contour_width_px: float = setting(
         0.5, "softness of the projected contour; zeta = f / (z_input * contour_width_px)", above=0
@@ -99,9 +99,9 @@ class StageConfig(Settings):
     )
     over_relaxation: float = setting(
         1.0,
-        "length of a step, as a multiple of Gauss-Newton's; after a step that did not pay the next one is plain. With "
-        "robust weights the Gauss-Newton matrix overestimates the curvature, so plain steps (1, the paper's) stop "
-        "short of the minimum; a quadratic energy falls below 2 only",
+        "length of a step, as a multiple of Gauss-Newton's; after a step that gained next to nothing the next one is "
+        "plain (1, the paper's). Plain steps stop short of the minimum, for robust weights make the matrix "
+        "overestimate the curvature",
         at_least=1,
         at_most=1.99,
     )
@@ -136,10 +136,9 @@ class RigConfig(Settings):
 
     disparity_sigma_px: float = setting(
         0.0,
-        "standard deviation of the rig's disparity about its calibration, an offset that all pixels of a car share: "
-        "one more unknown of each car, so that depth by disparity is weighed against the silhouettes' size and the "
-        "detector's depth. 0 for a perfect rig, without that unknown; about 0.1 where a residual disparity field was "
-        "fitted, 0.5 and more where none was",
+        "standard deviation of an unknown offset of the disparity, one for each car, which weighs depth by disparity "
+        "against the size of the silhouettes and the detector's depth: 0 for no such unknown, about 0.1 where a "
+        "residual disparity field was fitted, 0.5 and more where none was",
         at_least=0,
     )
 
@@ -155,8 +154,8 @@ class BackwardConfig(Settings):
     )
     unroll_iterations: int = setting(
         1000,
-        "how many of the last accepted steps are repeated at most; fewer than there are leave the input pose without "
-        "a gradient",
+        "how many of the last accepted steps are repeated at most; if steps are left out, the input pose has no "
+        "gradient",
         at_least=1,
     )
     max_remaining_step: float = setting(
@@ -197,8 +196,8 @@ class PhotometricConfig(Settings):
     )
     brightness: Literal["none", "gain", "affine"] = setting(
         "gain",
-        'how that of the two images is matched, car by car at the start of each stage: "gain" (a factor), "affine" (a '
-        'factor and an offset, for cameras of different black level or contrast) or "none" (the paper)',
+        'how the brightness of the two images is matched, for each car at the start of each stage: "gain" (a factor), '
+        '"affine" (a factor and an offset, for cameras of different black level or contrast) or "none" (the paper)',
     )
     patch: Literal["plain", "zero_mean", "normalised"] = setting(
         "plain",
@@ -220,10 +219,11 @@ class PointCloudConfig(Settings):
     huber_m: float = setting(0.1, "corner of the Huber norm", above=0)
     min_points: int = setting(
         200,
-        'with fewer of them "geometric" leaves the car alone (status too_few_points) and "combined" has images only',
+        'a car with fewer points keeps its input under "geometric" (status too_few_points) and has images only under '
+        '"combined"',
         at_least=0,
     )
-    max_points: int = setting(1000, "of more points than these every n-th is used", above=0, at_least="min_points")
+    max_points: int = setting(1000, "most points of a car: of more, every n-th is used", above=0, at_least="min_points")
     order: Literal["alternating", "joint"] = setting(
         "alternating",
         '"alternating" (pose, then shape, as in the paper by Engelmann et al.) or "joint", for "geometric"; the other '
@@ -265,23 +265,25 @@ class PriorConfig(Settings):
     )
     pose_weight: float = setting(
         0.2,
-        "weight of the difference between the pose and the detector's, in units of the detector's standard deviations: "
-        "those of the detections where they have some, else those below; without either it does nothing",
+        "weight of the detector's pose, in units of its standard deviations: those of the detections where they have "
+        "some, else those below; without either it does nothing",
         at_least=0,
     )
     pose_sigma_along_share: float = setting(
         0.0,
-        "standard deviation of the detector's position along the viewing ray on the ground, as a share of the distance;"
-        " 0 for not known, as in the next four",
+        "standard deviation of the detector's position along the viewing ray on the ground, as a share of the distance "
+        "(in this and the next four, 0 means not known)",
         at_least=0,
     )
     pose_sigma_along_m: float = setting(
-        0.0, "its part in metres, beside that share (both: the root of the sum of squares)", at_least=0
+        0.0, "a constant part of it in metres, added to the share in squares", at_least=0
     )
     pose_sigma_across_m: float = setting(
-        0.0, "its standard deviation across the viewing ray, on the ground", at_least=0
+        0.0, "standard deviation of the detector's position across the viewing ray, on the ground", at_least=0
     )
-    pose_sigma_vertical_m: float = setting(0.0, "its standard deviation along the camera's y axis", at_least=0)
+    pose_sigma_vertical_m: float = setting(
+        0.0, "standard deviation of the detector's position along the camera's y axis", at_least=0
+    )
     pose_sigma_yaw_deg: float = setting(0.0, "standard deviation of the detector's heading", at_least=0)
 
     @property
@@ -293,7 +295,7 @@ class PriorConfig(Settings):
 
 @dataclass(frozen=True)
 class TracksConfig(Settings):
-    """How the frames of cars with numbers belong together (docs/tracks.md)."""
+    """How the frames of a tracked car belong together (docs/tracks.md)."""
 
     next_view_weight: float = setting(
         0.15,
@@ -302,15 +304,17 @@ class TracksConfig(Settings):
     )
     path_sigma_m: float = setting(
         0.05,
-        "standard deviation of a car's place on the ground about a smooth path, where the times of the frames are "
-        "known; 0: each frame by itself",
+        "standard deviation of a car's position on the ground about a smooth path, where the times of the frames are "
+        "known; 0: no path",
         at_least=0,
     )
-    path_sigma_yaw_deg: float = setting(1.0, "that of its heading", above=0)
+    path_sigma_yaw_deg: float = setting(1.0, "standard deviation of a car's heading about that path", above=0)
     acceleration_sigma_mps2: float = setting(
         1.0, "standard deviation of the acceleration of the path, along each axis, m/s^2", above=0
     )
-    turn_acceleration_sigma_dps2: float = setting(20.0, "that of its turn rate's change, deg/s^2", above=0)
+    turn_acceleration_sigma_dps2: float = setting(
+        20.0, "standard deviation of the change of its turn rate, deg/s^2", above=0
+    )
 
 
 @dataclass(frozen=True)
@@ -351,14 +355,13 @@ class AcceptanceConfig(Settings):
 
     min_probability_better: float = setting(
         0.7,
-        "least probability of overlapping the true box more than the input does, seen from above, as far as the course "
-        'of the refinement tells (docs/results.md, "When to trust a result")',
+        'least probability that the BEV IoU rose (docs/results.md, "When to trust a result")',
         at_least=0,
         at_most=1,
     )
     min_probability_not_worse: float = setting(
         0.0,
-        "least probability of not overlapping it less by more than 0.05; 0 and 0 return every result",
+        "least probability that it fell by at most 0.05; 0 for both returns every result",
         at_least=0,
         at_most=1,
     )
@@ -375,9 +378,9 @@ class RefinerConfig(Settings):
     )
     compile: Literal["auto", "on", "off"] = setting(
         "auto",
-        'compile the hot functions: "on", "off", or "auto" where there is a C++ compiler and the job, or the process '
-        "so far if nobody knows, has at least 3000 cars. Results differ in the last digits, so a choice makes runs "
-        "repeatable to the bit, whatever came before them",
+        'compile the hot functions: "on", "off", or "auto" (where there is a C++ compiler and the job, or the process '
+        'so far, has at least 3000 cars). Compiled results differ in the last digits: "on" or "off" repeats them '
+        "to the bit",
     )
     check: Literal["first", "always", "off"] = setting(
         "first",
