@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import colorsys
 import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from directshape_torch.errors import MissingDependencyError
@@ -16,14 +16,14 @@ from directshape_torch.export.box_files import image_numbers
 from directshape_torch.export.frame_source import Exporter, FrameSource
 from directshape_torch.export.painted_cars import ground_grid
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.io.kitti_labels import KittiObject, poses_cam
+from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observation.extents import MASK_THRESHOLD
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.zero_level import sdf_to_mesh
 from directshape_torch.stereo_matching.disparity import rgb8
 from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Colour
+from directshape_torch.visualize.drawn_car import corners_cam
 from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
 from directshape_torch.visualize.residuals import CarResiduals, photometric_colours, silhouette_colours
 
@@ -68,7 +68,7 @@ class RerunExporter(Exporter):
         stream, frame = self._stream, self.numbers[source.frame_id]
         stream.at(frame, None if refiner is None else self.iteration)
         _log_images(stream, loaded)
-        _log_boxes(stream, source, loaded)
+        _log_boxes(stream, source)
         ground = ground_grid(loaded.frame.ground.normal[0], float(loaded.frame.ground.offset[0]))
         stream.log_mesh("world/ground", ground, GREY)
         stream.at(frame)
@@ -109,11 +109,9 @@ class RerunExporter(Exporter):
 def _log_conventions(stream: _Stream) -> None:
     """The world is the left camera frame: x right, y down, z forward, metres. Masks have the numbers of lines."""
     stream.log("world", stream.rr.ViewCoordinates.RDF, static=True)
-    classes: list[tuple[int, str, tuple[int, int, int, int]]] = [(0, "no car", (0, 0, 0, 0))]
-    for number in range(1, _MOST_LINES + 1):
-        # Hues a golden angle apart differ as much as they can.
-        red, green, blue = (round(255 * part) for part in colorsys.hsv_to_rgb((number * 0.618) % 1, 0.8, 1.0))
-        classes.append((number, f"car {number}", (red, green, blue, 255)))
+    # The viewer gives each number a colour of its own.
+    classes: list[Any] = [(0, "no car", (0, 0, 0, 0))]
+    classes += [(number, f"car {number}") for number in range(1, _MOST_LINES + 1)]
     for entity in (_LEFT, _RIGHT):
         stream.log(f"{entity}/masks", stream.rr.AnnotationContext(classes), static=True)
 
@@ -142,25 +140,21 @@ def _log_images(stream: _Stream, loaded: LoadedFrame) -> None:
         stream.log(f"{entity}/masks", rr.SegmentationImage(numbers, opacity=_MASK_OPACITY))
 
 
-def _log_boxes(stream: _Stream, source: FrameSource, loaded: LoadedFrame) -> None:
+def _log_boxes(stream: _Stream, source: FrameSource) -> None:
     """Those that went in, of the truth, and of the result, where grey ones were not refined."""
-    t_cam_ref = loaded.frame.camera.t_cam_ref[0].double()
-
-    def log_lines(entity: str, lines: Sequence[KittiObject], colour: Colour) -> None:
-        hwl = np.array([one.hwl for one in lines], dtype=np.float64)
-        labels = [f"{one.line_number}" for one in lines]
-        stream.log_boxes(entity, poses_cam(lines, t_cam_ref).numpy(), hwl, [colour] * len(lines), labels)
-
-    log_lines("world/boxes/before", loaded.detected_objects if source.inputs.has_detections else [], ORANGE)
-    classes = set(source.inputs.run.classes)
-    log_lines("world/boxes/truth", [o for o in loaded.labels or [] if o.has_box_3d and o.type in classes], GREEN)
-    cars = [one for one in source.result.objects if one.car >= 0]
+    before = source.before or []
+    corners = np.array([car.corners_cam for car in before])
+    stream.log_boxes("world/boxes/before", corners, [ORANGE] * len(before), [f"{car.line}" for car in before])
+    truth = np.array(source.truth_corners_cam)
+    stream.log_boxes("world/boxes/truth", truth, [GREEN] * len(truth), ["truth"] * len(truth))
+    cars, t_cam_ref = [one for one in source.result.objects if one.car >= 0], source.t_cam_ref.numpy()
     T_cam_box = np.tile(np.eye(4), (len(cars), 1, 1))
     for T, one in zip(T_cam_box, cars, strict=True):
-        T[:3, :3], T[:3, 3] = one.R_ref_obj, one.bottom_ref + t_cam_ref.numpy()
+        T[:3, :3], T[:3, 3] = one.R_ref_obj, one.bottom_ref + t_cam_ref
+    hwl = torch.tensor(np.array([one.hwl for one in cars]).reshape(-1, 3))
     colours = [BLUE if one.is_refined else GREY for one in cars]
     labels = [f"{one.line.line_number} {one.status}" for one in cars]
-    stream.log_boxes("world/boxes/after", T_cam_box, np.array([one.hwl for one in cars]), colours, labels)
+    stream.log_boxes("world/boxes/after", box_corners(torch.from_numpy(T_cam_box), hwl).numpy(), colours, labels)
 
 
 class _IterationLog:
@@ -205,11 +199,10 @@ class _IterationLog:
 
     def _log_boxes(self, number: int) -> None:
         """Boxes measured on the zero level of the state, as those of a result are."""
-        then, rows = self.trace.moment(number).boxes(), self.trace.rows
-        location_cam = (then.location_ref + self.trace.result.t_cam_ref)[rows].double().cpu()
-        T_cam_box = pose_from_kitti(location_cam, then.rotation_y[rows].double().cpu()).numpy()
-        hwl, labels = then.dimensions_hwl[rows].double().cpu().numpy(), [f"{self.line(car)}" for car in self.cars]
-        self.stream.log_boxes("world/boxes/iteration", T_cam_box, hwl, [_STATE_RGB] * len(labels), labels)
+        then, labels = self.trace.moment(number)[self.trace.rows], [f"{self.line(car)}" for car in self.cars]
+        boxes = then.boxes()
+        corners = corners_cam(boxes.location_ref, boxes.rotation_y, boxes.dimensions_hwl, then.t_cam_ref)
+        self.stream.log_boxes("world/boxes/iteration", corners, [_STATE_RGB] * len(labels), labels)
 
 
 def _import_rerun() -> Any:
@@ -259,20 +252,22 @@ class _Stream:
     def log_boxes(
         self,
         entity: str,
-        T_cam_box: NDArray[np.float64],  # (B, 4, 4) at the middle of the bottom, y down
-        hwl: NDArray[np.float64],  # (B, 3)
-        colours: Sequence[tuple[int, int, int]],
+        corners_cam: NDArray[np.floating[Any]],  # (B, 8, 3) in the order of `box_corners`
+        colours: Sequence[Colour],
         labels: Sequence[str],
     ) -> None:
         """Boxes with length, height, width along the axes of their objects."""
         from scipy.spatial.transform import Rotation
 
-        hwl, T_cam_box = hwl.reshape(-1, 3), T_cam_box.reshape(-1, 4, 4)
-        quaternions = Rotation.from_matrix(T_cam_box[:, :3, :3]).as_quat() if len(hwl) else np.zeros((0, 4))
+        corners = corners_cam.astype(np.float64).reshape(-1, 8, 3)
+        axes = corners[:, [0, 0, 1]] - corners[:, [3, 4, 0]]
+        sizes = np.linalg.norm(axes, axis=2)
+        # Axes are rows here.
+        inverse = Rotation.from_matrix(axes / sizes[:, :, None]) if len(axes) else None
         boxes = self.rr.Boxes3D(
-            centers=T_cam_box[:, :3, 3] - 0.5 * hwl[:, :1] * T_cam_box[:, :3, 1],
-            half_sizes=0.5 * hwl[:, [2, 0, 1]],
-            quaternions=[self.rr.Quaternion(xyzw=q) for q in quaternions],
+            centers=corners.mean(axis=1),
+            half_sizes=0.5 * sizes,
+            quaternions=[] if inverse is None else [self.rr.Quaternion(xyzw=q) for q in inverse.inv().as_quat()],
             colors=np.array(colours, dtype=np.uint8).reshape(-1, 3),
             labels=list(labels),
             show_labels=False,

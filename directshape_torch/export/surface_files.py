@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.export.box_files import image_numbers
 from directshape_torch.export.frame_source import Exporter, FrameSource
-from directshape_torch.export.painted_cars import Paint, PaintedFrame, Points, ground_grid
+from directshape_torch.export.painted_cars import SEEN, Paint, PaintedFrame, ground_grid
 from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.files.mesh_files import T_GLTF_CAM
 from directshape_torch.io.run_folder import FrameResult, ResultObject
@@ -24,7 +24,6 @@ _GREY_OF_GROUND = (120, 120, 120)
 _UNSIGNED_SHORT, _FLOAT = 5123, 5126
 _SECONDS_A_FRAME = 0.1
 _CAR, _CAMERA = "car", "left camera"
-_PLY_HEADER = "ply\nformat binary_little_endian 1.0\ncomment left camera frame: x right, y down, z forward, metres\n"
 
 
 class GlbExporter(Exporter):
@@ -210,47 +209,36 @@ class PlyExporter(Exporter):
     """`ply/NNNNNN_LINE.ply`: the surface of each refined car, with normals, sRGB and `color_source` (see `Paint`)."""
 
     def add(self, source: FrameSource) -> None:
-        from trimesh.exchange.ply import export_ply
-        from trimesh.visual import ColorVisuals
-
         for index, one in enumerate(source.painted.objects):
-            mesh, paint = source.painted.mesh(index)
-            opaque = np.full((len(paint.rgb), 1), 255, dtype=np.uint8)
-            mesh.visual = ColorVisuals(mesh, vertex_colors=np.concatenate([paint.rgb, opaque], axis=1))
-            mesh.vertex_attributes["color_source"] = paint.source
-            content: bytes = export_ply(mesh, vertex_normal=True)
-            write_bytes(self.folder / "ply" / f"{source.frame_id}_{one.line.line_number}.ply", content)
+            path = self.folder / "ply" / f"{source.frame_id}_{one.line.line_number}.ply"
+            write_bytes(path, _ply(*source.painted.mesh(index)))
 
 
 class PointsExporter(Exporter):
     """`points/NNNNNN_LINE.ply` of each refined car, and beside it `.._stereo.ply` where stereo saw any."""
 
     def add(self, source: FrameSource) -> None:
+        import trimesh
+
         painted, measured = source.painted, source.painted.stereo_points()
         for index, one in enumerate(painted.objects):
             stem = self.folder / "points" / f"{source.frame_id}_{one.line.line_number}"
             points_cam, normals_cam, paint = painted.samples(index, self.options.points_per_car)
-            write_bytes(f"{stem}.ply", _points_ply(points_cam, paint.rgb, normals_cam, paint.source))
+            spread = trimesh.Trimesh(points_cam, vertex_normals=normals_cam, process=False)
+            write_bytes(f"{stem}.ply", _ply(spread, paint))
             if one.line.line_number in measured:
-                write_bytes(f"{stem}_stereo.ply", _points_ply(*measured[one.line.line_number]))
+                points_cam, rgb = measured[one.line.line_number]
+                paint = Paint(rgb, np.full(len(rgb), SEEN, np.uint8))
+                write_bytes(f"{stem}_stereo.ply", _ply(trimesh.Trimesh(points_cam, process=False), paint, False))
 
 
-def _points_ply(
-    points_cam: Points,  # (N, 3) metres
-    rgb: NDArray[np.uint8],  # (N, 3) sRGB
-    normals_cam: Points | None = None,  # (N, 3) unit length
-    source: NDArray[np.uint8] | None = None,  # (N,) see `Paint`
-) -> bytes:
-    """x y z, normals where there are any, red green blue, `color_source` where it is known."""
-    columns: list[tuple[str, str, NDArray[Any]]] = [(name, "<f4", points_cam[:, k]) for k, name in enumerate("xyz")]
-    if normals_cam is not None:
-        columns += [(f"n{name}", "<f4", normals_cam[:, k]) for k, name in enumerate("xyz")]
-    columns += [(name, "u1", rgb[:, k]) for k, name in enumerate(("red", "green", "blue"))]
-    if source is not None:
-        columns.append(("color_source", "u1", source))
-    table = np.empty(len(points_cam), dtype=[(name, kind) for name, kind, _ in columns])
-    for name, _, values in columns:
-        table[name] = values
-    types = {"<f4": "float", "u1": "uchar"}
-    properties = "".join(f"property {types[kind]} {name}\n" for name, kind, _ in columns)
-    return f"{_PLY_HEADER}element vertex {len(table)}\n{properties}end_header\n".encode() + table.tobytes()
+def _ply(mesh: trimesh.Trimesh, paint: Paint, with_normals: bool = True) -> bytes:
+    """A surface or, without triangles, points."""
+    from trimesh.exchange.ply import export_ply
+    from trimesh.visual import ColorVisuals
+
+    opaque = np.full((len(paint.rgb), 1), 255, dtype=np.uint8)
+    mesh.visual = ColorVisuals(mesh, vertex_colors=np.concatenate([paint.rgb, opaque], axis=1))
+    mesh.vertex_attributes["color_source"] = paint.source
+    content: bytes = export_ply(mesh, vertex_normal=with_normals)
+    return content

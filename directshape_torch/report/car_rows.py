@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
 from typing import Any
 
 from directshape_torch.evaluation.matching import is_counted, match_to_labels
@@ -13,43 +12,13 @@ from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.report.page_parts import known
 from directshape_torch.visualize.drawn_car import is_refined
 
+CarRow = dict[str, Any]
+"""One car of the table by the names of its columns; None for what is not known."""
 
-@dataclass(frozen=True, kw_only=True)
-class CarRow:
-    """One car of the table; None for what is not known."""
-
-    frame: int  # number of its frame in the page
-    line: int  # in the detection file, from 1
-    track: str  # the name of its track, "" for none
-    track_part: int  # 0 where it shares the track's shape, 1, 2 .. for later parts of one that was split, -1 alone
-    type: str
-    status: str  # how its refinement ended
-    refined: bool  # whether its state is a refined one
-    x_m: float | None  # of the result in the left camera frame, on the ground
-    y_m: float | None
-    distance_m: float | None
-    score: float | None  # the detector's
-    cost_before: float | None  # sum over the terms
-    cost_after: float | None
-    mask_iou: float | None  # overlap with the left mask, with the right one where there is no left
-    photometric_error_grey: float | None  # mean difference of the images, 0..255
-    probability_better: float | None  # calibrated
-    sigma_depth_m: float | None  # calibrated, along z
-    iterations: int
-    length_m: float | None  # of the result
-    width_m: float | None
-    height_m: float | None
-    counts: bool | None = None  # whether `directshape compare` would count its label; None without a label
-    centre_before_m: float | None = None  # errors against the label
-    centre_after_m: float | None = None
-    yaw_before_deg: float | None = None
-    yaw_after_deg: float | None = None
-    iou_before: float | None = None
-    iou_after: float | None = None
-    unseen: str  # the direction that the view shows least, in words
-
-
-CAR_COLUMNS = tuple(entry.name for entry in fields(CarRow))
+# Errors against the label, and whether `directshape compare` would count it.
+_JUDGED: CarRow = dict.fromkeys(
+    ("counts", "centre_before_m", "centre_after_m", "yaw_before_deg", "yaw_after_deg", "iou_before", "iou_after")
+)
 
 
 def car_rows(
@@ -60,39 +29,36 @@ def car_rows(
 ) -> list[CarRow]:
     """The rows of the frame of that number in the page; without detections or labels what follows from them is None."""
     judged = {} if labels is None else _judged(detections, result.cars, labels)
-    return [_row(frame, result, car, judged.get(car, {})) for car in range(len(result.cars))]
+    return [{**_row(frame, result, car), **_JUDGED, **judged.get(car, {})} for car in range(len(result.cars))]
 
 
-def _row(frame: int, result: FrameResult, car: int, judged: dict[str, Any]) -> CarRow:
+def _row(frame: int, result: FrameResult, car: int) -> CarRow:
     shapes, kitti = result.shapes, result.cars[car]
     ious = [known(array[car]) for array in (shapes.mask_iou_left, shapes.mask_iou_right)]
-    height, width, length = (known(size, 3) for size in shapes.boxes_hwl[car])
-    x_m, y_m, distance_m = (known(coordinate, 2) for coordinate in shapes.T_cam_obj[car, :3, 3])
-    return CarRow(
-        frame=frame,
-        line=int(shapes.input_lines[car]),
-        track=shapes.tracks[car],
-        track_part=int(shapes.track_parts[car]),
-        type=kitti.type,
-        status=shapes.statuses[car],
-        refined=is_refined(shapes.statuses[car]),
-        x_m=x_m,
-        y_m=y_m,
-        distance_m=distance_m,
-        score=known(kitti.score),
-        cost_before=known(shapes.costs_before[car].sum()),
-        cost_after=known(shapes.costs_after[car].sum()),
-        mask_iou=ious[0] if ious[0] is not None else ious[1],
-        photometric_error_grey=known(shapes.photometric_errors_grey[car], 2),
-        probability_better=known(shapes.probabilities_better[car]),
-        sigma_depth_m=known(shapes.sigmas_ref[car, 2]),
-        iterations=int(shapes.iterations[car]),
-        length_m=length,
-        width_m=width,
-        height_m=height,
-        unseen=shapes.unseen[car],
-        **judged,
-    )
+    # Of the result in the left camera frame, on the ground.
+    place = zip(("x_m", "y_m", "distance_m"), shapes.T_cam_obj[car, :3, 3], strict=True)
+    sizes = zip(("height_m", "width_m", "length_m"), shapes.boxes_hwl[car], strict=True)
+    return {
+        "frame": frame,
+        "line": int(shapes.input_lines[car]),  # in the detection file, from 1
+        "track": shapes.tracks[car],  # "" for none
+        # 0 where it shares the track's shape, 1, 2 .. for later parts of one that was split, -1 alone.
+        "track_part": int(shapes.track_parts[car]),
+        "type": kitti.type,
+        "status": shapes.statuses[car],
+        "refined": is_refined(shapes.statuses[car]),
+        **{name: known(value, 2) for name, value in place},
+        "score": known(kitti.score),  # the detector's
+        "cost_before": known(shapes.costs_before[car].sum()),
+        "cost_after": known(shapes.costs_after[car].sum()),
+        "mask_iou": ious[0] if ious[0] is not None else ious[1],  # of the left mask, else of the right one
+        "photometric_error_grey": known(shapes.photometric_errors_grey[car], 2),  # mean, 0..255
+        "probability_better": known(shapes.probabilities_better[car]),  # calibrated, as the next
+        "sigma_depth_m": known(shapes.sigmas_ref[car, 2]),
+        "iterations": int(shapes.iterations[car]),
+        **{name: known(value, 3) for name, value in sizes},
+        "unseen": shapes.unseen[car],  # the direction that the view shows least, in words
+    }
 
 
 def _judged(
@@ -118,12 +84,12 @@ def car_gains(rows: Sequence[CarRow]) -> list[tuple[float, int]]:
     By the overlap with the label where the run has labels, else by the probability to be better; the two cannot be
     compared. Cars that were not refined have none. The page's `highlights.js` ranks by the same rule.
     """
-    refined = [row for row in rows if row.refined]
-    judged = [(row.iou_before, row.iou_after, row.frame) for row in refined]
+    refined = [row for row in rows if row["refined"]]
+    judged = [(row["iou_before"], row["iou_after"], row["frame"]) for row in refined]
     by_labels = [(after - before, f) for before, after, f in judged if before is not None and after is not None]
-    if any(row.iou_before is not None for row in rows):
+    if any(row["iou_before"] is not None for row in rows):
         return sorted(by_labels)
-    return sorted((row.probability_better, row.frame) for row in refined if row.probability_better is not None)
+    return sorted((row["probability_better"], row["frame"]) for row in refined if row["probability_better"] is not None)
 
 
 def choose_frames(rows: Sequence[CarRow], num_frames: int, most: int) -> list[int]:

@@ -19,7 +19,7 @@ from directshape_torch.files.atomic_files import replaced_file
 from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.run_manifest import flatten, hash_fields
-from directshape_torch.report.car_rows import CAR_COLUMNS, CarRow, car_rows, choose_frames
+from directshape_torch.report.car_rows import CarRow, car_rows, choose_frames
 from directshape_torch.report.frame_details import frame_details
 from directshape_torch.report.page_parts import data_block, data_url, mesh_data, page_frame
 from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, load_rigs
@@ -79,7 +79,9 @@ def make_report(
             observer.finished(run.frame_ids[number], None)
         notes = _notes(inputs, len(detailed))
         file.write(data_block("frames", {"ids": list(run.frame_ids), "detailed": detailed}))
-        file.write(data_block("cars", {"columns": CAR_COLUMNS, "rows": [list(vars(row).values()) for row in rows]}))
+        file.write(
+            data_block("cars", {"columns": list(rows[0]) if rows else [], "rows": [list(row.values()) for row in rows]})
+        )
         file.write(data_block("run", _run_facts(run, rows, grounds, notes)))
         file.write(foot)
     return ReportOutcome(page, page.stat().st_size, len(run.frame_ids), len(detailed), len(rows), tuple(notes))
@@ -124,7 +126,7 @@ def _run_facts(
         "frames_done": len(run.frame_ids),
         "failed": {name: why for name, why in manifest.failed.items() if name not in run.frame_ids},
         "cars": len(rows),
-        "refined": sum(row.refined for row in rows),
+        "refined": sum(row["refined"] for row in rows),
         "statuses": _statuses(rows),
         "ground_sources": dict(grounds),
         "sha256": dict(manifest.sha256),
@@ -148,7 +150,7 @@ def _rig(run: RunFolder) -> dict[str, Any] | None:
 
 def _statuses(rows: Sequence[CarRow]) -> list[dict[str, Any]]:
     """Name, number and meaning of each status that occurs, in the order of `Status`."""
-    counts = Counter(row.status for row in rows)
+    counts = Counter(row["status"] for row in rows)
     order = [name for name in Status.__members__ if name in counts]
     order += sorted(set(counts) - set(order))
     known = Status.__members__
@@ -157,16 +159,16 @@ def _statuses(rows: Sequence[CarRow]) -> list[dict[str, Any]]:
 
 def _mean_errors(rows: Sequence[CarRow]) -> dict[str, Any] | None:
     """Mean errors over the cars that `directshape compare` counts; before and after over the same cars."""
-    counted = [row for row in rows if row.counts]
+    counted = [row for row in rows if row["counts"]]
     if not counted:
         return None
     names = ("centre_before_m", "centre_after_m", "yaw_before_deg", "yaw_after_deg", "iou_before", "iou_after")
-    columns = {name: [getattr(row, name) for row in counted] for name in names}
+    columns = {name: [row[name] for row in counted] for name in names}
     means = {name: None if None in values else statistics.fmean(values) for name, values in columns.items()}
     for side in ("before", "after"):
         overlaps = columns[f"iou_{side}"]
         means[f"share_over_0.7_{side}"] = None if None in overlaps else statistics.fmean(v > 0.7 for v in overlaps)
-    pairs = [(row.iou_before, row.iou_after) for row in counted]
+    pairs = [(row["iou_before"], row["iou_after"]) for row in counted]
     changes = [after - before for before, after in pairs if before is not None and after is not None]
     worse = sum(change < -WORSE_BY_BEV_IOU for change in changes) if changes else None
     return {"cars": len(counted), "worse": worse, "worse_by_iou": WORSE_BY_BEV_IOU, **means}

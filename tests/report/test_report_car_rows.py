@@ -29,25 +29,24 @@ def result(*cars: KittiObject, **changes: object) -> FrameResult:
 def test_what_is_not_known_is_none() -> None:
     unknown = np.full(2, np.nan)
     rows = car_rows(0, result(car(1, 100), car(2, 300), mask_iou_left=unknown, probabilities_better=unknown))
-    assert rows[0].mask_iou == 0.9
-    assert rows[0].probability_better is None
-    assert rows[0].counts is None
-    assert rows[0].iou_after is None
-    assert [row.refined for row in rows] == [True, False]
+    assert rows[0]["mask_iou"] == 0.9
+    assert rows[0]["probability_better"] is None
+    assert rows[0]["counts"] is None
+    assert rows[0]["iou_after"] is None
+    assert [row["refined"] for row in rows] == [True, False]
     hidden = car_rows(0, result(car(1, 100)), None, [car(1, 100, occluded=2)])[0]
-    assert hidden.counts is False
-    assert hidden.iou_before is None
-    assert hidden.iou_after == pytest.approx(1)
+    assert hidden["counts"] is False
+    assert hidden["iou_before"] is None
+    assert hidden["iou_after"] == pytest.approx(1)
 
 
 def test_status_of_a_later_version_is_no_refined_one() -> None:
     (row,) = car_rows(0, result(car(1, 100), statuses=("wondrous",)))
-    assert (row.status, row.refined) == ("wondrous", False)
+    assert (row["status"], row["refined"]) == ("wondrous", False)
 
 
 def row(frame: int, **changes: object) -> CarRow:
-    plain = car_rows(frame, result(car(1, 100)))[0]
-    return replace(plain, **changes)  # type: ignore[arg-type]
+    return car_rows(frame, result(car(1, 100)))[0] | changes
 
 
 def test_gains_are_of_one_kind() -> None:

@@ -18,7 +18,7 @@ const observer = new IntersectionObserver((entries) => {
 // The picture of a car "before" or "after"; `whenMissing` is called where there is none.
 export function thumbnail(car, name) {
   const words = name === "before" ? "before, the detection with the mean shape" : "after the refinement";
-  const image = element("img", { class: "thumbnail", alt: `Car ${carName(car)} ${words}`, decoding: "async", width: 126, height: 84 });
+  const image = element("img", { class: "thumbnail", alt: `Car ${carName(car)} ${words}`, decoding: "async", width: 110, height: 73 });
   image.dataset.car = car.index;
   waiting.set(image, () => {
     const url = thumbnailsOf(car)[name];
