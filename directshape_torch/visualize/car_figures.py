@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -16,8 +16,8 @@ from directshape_torch.config import SamplingMode
 from directshape_torch.errors import InputError
 from directshape_torch.io.instance_masks import SIDES
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.observation.occlusion import Side, occlusion_map
-from directshape_torch.observation.packing import car_regions, residual_offsets, sampled_pixels
+from directshape_torch.observation.occlusion import Side
+from directshape_torch.observation.packing import pack_pixels, residual_offsets
 from directshape_torch.observation.refinable import without_empty_masks
 from directshape_torch.visualize.drawing import (
     BLUE,
@@ -35,7 +35,7 @@ from directshape_torch.visualize.drawing import (
     titled,
 )
 from directshape_torch.visualize.drawn_car import DrawnCar, cars_of_result
-from directshape_torch.visualize.overlay import Footprint, birds_eye_picture
+from directshape_torch.visualize.overlay import draw_footprint, ground_view
 from directshape_torch.visualize.refinement_trace import RefinementTrace
 from directshape_torch.visualize.residuals import WORST_GREY_LEVELS, CarResiduals, PixelResiduals, draw_residuals
 
@@ -137,38 +137,37 @@ class CarCourse:
             found = cv2.warpAffine(mask, view.from_image[:2], size_wh, flags=cv2.INTER_LINEAR)
             draw_outline(view.picture, (found > 0.5).astype(np.uint8), WHITE, 1)
 
-    def from_above(self, count: int, height_px: int) -> Picture:
-        """The first `count` boxes and the true one."""
-        inks, shown = _step_inks(len(self.cars)), self.cars[:count]
-        boxes = [] if self.truth_corners_cam is None else [Footprint(self.truth_corners_cam, GREEN, 3)]
-        boxes += [Footprint(car.corners_cam, ink) for car, ink in zip(shown[:-1], inks, strict=False)]
-        boxes += [Footprint(shown[-1].corners_cam, inks[count - 1], 2)]
-        # All boxes fit, whichever are drawn.
-        frame = [Footprint(car.corners_cam, (28, 30, 34)) for car in self.cars]
-        return birds_eye_picture([*frame, *boxes], (height_px, _PANEL_PX[1]), with_camera=False)
+    def from_above(self, count: int) -> Picture:
+        """The first `count` boxes and the true one; all boxes would fit, so that pictures can follow one another."""
+        truth = [] if self.truth_corners_cam is None else [self.truth_corners_cam]
+        points_cam = np.concatenate([*truth, *(car.corners_cam for car in self.cars)])
+        ground = ground_view(points_cam, _PANEL_PX[1:] * 2, margin_m=0.7, least_depth_m=1.0)
+        for corners_cam in truth:
+            draw_footprint(ground, corners_cam, GREEN, 3)
+        for place, (car, ink) in enumerate(zip(self.cars[:count], _step_inks(len(self.cars)), strict=False)):
+            draw_footprint(ground, car.corners_cam, ink, 2 if place == count - 1 else 1)
+        return ground.picture
 
 
-def sampled_pixels_of(car: CarCourse, side: Side) -> tuple[NDArray[np.int64], int, SamplingMode]:
-    """The pixels (P, 2) as the refinement chose them, how many a nearer instance hides, and the way of choosing."""
-    config = car.trace.config.sampling
-    frames, detections = car.loaded.frame, without_empty_masks(car.loaded.detections)
-    left, right = car_regions(frames, detections)
-    images, regions, mode = (
-        (frames.images_left, left, config.mode) if side == "left" else (frames.images_right, right, config.mode_right)
+def sampled_pixels_of(car: CarCourse, side: Side) -> tuple[NDArray[np.int64], int]:
+    """The pixels (P, 2) that the refinement used, and how many more a nearer instance hides."""
+    trace, config = car.trace, replace(car.trace.config.sampling, occlusion=False)
+    unhidden = pack_pixels(car.loaded.frame, without_empty_masks(car.loaded.detections), config)
+    (used, place), (found, row) = (
+        (seen.left if side == "left" else seen.right, number)
+        for seen, number in ((trace.pixels, trace.place_of(car.row)), (unhidden, car.row))
     )
-    of, uv = sampled_pixels(images, frames.sizes, detections.frame_index, regions, mode, config)
-    uv = uv[of == car.row]
-    hidden = occlusion_map(detections, side, config.occlusion_order).at(torch.tensor(car.row).to(uv.device), uv)
-    kept = ~hidden if config.occlusion else torch.ones_like(hidden)
-    return np.asarray(uv[kept].cpu()), int((~kept).sum()), mode
+    uv = used.uv[used.object_index == place]
+    return np.asarray(uv.long().cpu()), int((found.object_index == row).sum()) - len(uv)
 
 
 def sampling_figure(car: CarCourse) -> Picture:
     """The sampled pixels in both images."""
     panels = []
     for side in SIDES:
-        uv, num_hidden, mode = sampled_pixels_of(car, side)
-        words, ink = _CHOSEN[mode]
+        uv, num_hidden = sampled_pixels_of(car, side)
+        config = car.trace.config.sampling
+        words, ink = _CHOSEN[config.mode if side == "left" else config.mode_right]
         view = car.view(side, _LARGE_PX)
         car.draw_mask(view, side)
         for place in view.places(uv.astype(np.float64)).round().astype(int).tolist():
@@ -207,7 +206,7 @@ def iteration_frames(car: CarCourse) -> list[Picture]:
     inks, frames = _step_inks(len(car.cars)), []
     for place, (number, drawn) in enumerate(zip(car.steps, car.cars, strict=True)):
         images = [titled(car.outlined(side, [(drawn, inks[place])]), f"{side} image") for side in SIDES]
-        above = titled(car.from_above(place + 1, _PANEL_PX[1]), "seen from above")
+        above = titled(car.from_above(place + 1), "seen from above")
         chart = curves(costs, "cost", (_PANEL_PX[1], above.shape[0]), number)
         frames.append(titled(beside([*images, above, chart]), f"{car.title}, iteration {number}", legend=_legend(car)))
     return frames
@@ -224,7 +223,7 @@ def drift_figure(full: CarCourse, silhouettes: CarCourse) -> Picture:
             titled(car.outlined("left", [(car.cars[place], inks[place])]), f"{name}: iteration {car.steps[place]}")
             for place in places
         ]
-        above = titled(car.from_above(len(car.cars), _PANEL_PX[1]), f"{name}: seen from above")
+        above = titled(car.from_above(len(car.cars)), f"{name}: seen from above")
         rows.append(beside([above, *images]))
     towards = "input" if full.truth_corners_cam is None else "true"
     series = {"silhouettes alone": (silhouettes.distances, _RED), "all terms": (full.distances, BLUE)}

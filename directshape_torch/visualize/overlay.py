@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,8 +35,7 @@ _BIRDS_EYE_WIDTH_PX = 560
 # A thick contour would hide smaller cars.
 _TALL_PX = 60
 _TILES_A_ROW = (4, 7)
-_MARGIN_M = 3.0
-_LEAST_DEPTH_M = 15.0
+_CAMERA = np.array([[0.0, 0.0, 0.0], [-0.6, 0.0, 1.2], [0.6, 0.0, 1.2]])
 
 
 def overlay_of_frame(loaded: LoadedFrame, result: RefinementResult) -> Picture:
@@ -61,18 +59,21 @@ def overlay_picture(
         _image_row(view, after, f"{title}  after: refined box and shape"),
     ]
     left = beside([*rows, *_tile_rows(view, before, after, rows[0].shape[1])], below=True)
-    footprints = [
-        *(Footprint(corners, GREEN, 2, is_framed=False) for corners in truth_corners_cam),
-        *(Footprint(car.corners_cam, car.colour) for car in before),
-        *(Footprint(car.corners_cam, car.colour, 2, f"{car.line}") for car in after),
-    ]
-    right = birds_eye_picture(footprints, (left.shape[0], _BIRDS_EYE_WIDTH_PX))
+    boxes = [car.corners_cam for car in (*before, *after)]
+    ground = ground_view(np.concatenate([np.zeros((1, 3)), *boxes]), (left.shape[0], _BIRDS_EYE_WIDTH_PX))
+    for corners_cam in truth_corners_cam:
+        draw_footprint(ground, corners_cam, GREEN, 2)
+    for car in before:
+        draw_footprint(ground, car.corners_cam, car.colour)
+    for car in after:
+        draw_footprint(ground, car.corners_cam, car.colour, 2, f"{car.line}")
+    draw_line(ground, _CAMERA, GREY, closed=True)
     legend = {"before": ORANGE, "after": BLUE}
     legend |= {"ground truth": GREEN} if truth_corners_cam else {}
     legend |= {"not refined": GREY} if any(car.colour == GREY for car in after) else {}
-    draw_text(right, "seen from above", (12, 32), size=0.9)
-    draw_legend(right, legend, (8, 44))
-    return np.concatenate([left, right], axis=1)
+    draw_text(ground.picture, "seen from above", (12, 32), size=0.9)
+    draw_legend(ground.picture, legend, (8, 44))
+    return np.concatenate([left, ground.picture], axis=1)
 
 
 def _image_row(image: View, cars: Sequence[DrawnCar], title: str) -> Picture:
@@ -116,70 +117,54 @@ def _tile(image: View, before: DrawnCar, after: DrawnCar, size_wh: tuple[int, in
     return titled(np.concatenate(pictures), f"{after.line}: {after.distance_m:.1f} m{ending}", size=0.8)
 
 
-@dataclass(frozen=True)
-class Footprint:
-    """One box of the view from above."""
+def ground_view(
+    points_cam: Array,  # (N, 3) to be shown
+    size_hw: tuple[int, int],
+    margin_m: float = 3.0,
+    least_depth_m: float = 15.0,
+) -> View:
+    """The ground from above on a grid of metres, x to the right and z upwards, as large as fits.
 
-    corners_cam: Array  # (8, 3) in the order of `box_corners`: the first two are at the front
-    colour: Colour
-    thickness: int = 1  # of its outline, pixels
-    label: str = ""
-    is_framed: bool = True  # whether the picture is made large enough to show it
-
-
-def birds_eye_picture(
-    footprints: Sequence[Footprint], size_hw: tuple[int, int], *, with_camera: bool = True
-) -> Picture:
-    """The boxes on a grid of metres, as large as fits; (h, w, 3) of the given size, later boxes over earlier ones.
-
-    Without the camera it is of the boxes alone.
+    The points are in its middle; what is drawn later may lie outside.
     """
-    camera = np.array([[0.0, 0.0, 0.0], [-0.6, 0.0, 1.2], [0.6, 0.0, 1.2]])
-    framed = [f.corners_cam for f in footprints if f.is_framed]
-    points = np.concatenate([camera[:1], *framed] if with_camera or not framed else framed)
-    margin, least = (_MARGIN_M, _LEAST_DEPTH_M) if with_camera else (0.7, 1.0)
-    low, high = points[:, [0, 2]].min(axis=0) - margin, points[:, [0, 2]].max(axis=0) + margin
-    (height, width), middle = size_hw, (low + high) / 2
-    px_per_m = float(min(height / max(high[1] - low[1], least), width / (high[0] - low[0])))
-    bottom = low[1] if with_camera else middle[1] - height / px_per_m / 2
-    # x to the right, z upwards.
+    xz = points_cam[:, [0, 2]]
+    low, high = xz.min(axis=0) - margin_m, xz.max(axis=0) + margin_m
+    (height, width), (x, z) = size_hw, (low + high) / 2
+    px_per_m = float(min(height / max(high[1] - low[1], least_depth_m), width / (high[0] - low[0])))
+    left, bottom = x - width / px_per_m / 2, z - height / px_per_m / 2
     to_pixels = [
-        [px_per_m, 0.0, 0.0, width / 2 - px_per_m * middle[0]],
+        [px_per_m, 0.0, 0.0, -px_per_m * left],
         [0.0, 0.0, -px_per_m, height - 1 + px_per_m * bottom],
         [0.0, 0.0, 0.0, 1.0],
     ]
     ground = View(np.full((*size_hw, 3), GROUND, np.uint8), np.array(to_pixels))
     step = next(step for step in (1, 2, 5, 10, 20, 50, 1000) if px_per_m * step > 70)
-    _draw_grid(ground, step, middle[0] - width / px_per_m / 2, bottom)
-    if with_camera:
-        draw_line(ground, camera, GREY, closed=True)
-    for footprint in footprints:
-        _draw_footprint(ground, footprint)
-    return ground.picture
-
-
-def _draw_grid(ground: View, step_m: int, left: float, bottom: float) -> None:
-    (height, width), px_per_m = ground.picture.shape[:2], ground.P[0, 0]
     right, top = left + width / px_per_m, bottom + height / px_per_m
-    for x in _multiples(step_m, left, right):
+    for x in _multiples(step, left, right):
         draw_line(ground, np.array([[x, 0, bottom], [x, 0, top]]), GRID)
-    for z in _multiples(step_m, bottom, top):
+    for z in _multiples(step, bottom, top):
         draw_line(ground, np.array([[left, 0, z], [right, 0, z]]), GRID)
         # On the right: a legend stands on the left.
         v = ground.project(np.array([[0.0, 0.0, z]]))[0, 1]
         draw_text(ground.picture, f"{z} m", (width - 62, v - 4), GREY, 0.6)
+    return ground
 
 
 def _multiples(step: int, low: float, high: float) -> range:
     return range(math.ceil(low / step) * step, math.floor(high / step) * step + 1, step)
 
 
-def _draw_footprint(ground: View, footprint: Footprint) -> None:
-    corners, style = footprint.corners_cam[:4], (footprint.colour, footprint.thickness)
-    draw_line(ground, corners, *style, closed=True)
-    # An open line to the front shows which way the car points.
-    draw_line(ground, np.stack([corners.mean(axis=0), corners[:2].mean(axis=0)]), *style)
-    if footprint.label:
+def draw_footprint(
+    ground: View,
+    corners_cam: Array,  # (8, 3) of a box in the order of `box_corners`: the first two are at the front
+    colour: Colour,
+    thickness: int = 1,
+    label: str = "",
+) -> None:
+    """A box from above; an open line to the front shows which way the car points."""
+    corners = corners_cam[:4]
+    draw_line(ground, corners, colour, thickness, closed=True)
+    draw_line(ground, np.stack([corners.mean(axis=0), corners[:2].mean(axis=0)]), colour, thickness)
+    if label:
         pixels = ground.project(corners)
-        place = (pixels[:, 0].max() + 4, pixels[:, 1].mean() + 8)
-        draw_text(ground.picture, footprint.label, place, footprint.colour, 0.9)
+        draw_text(ground.picture, label, (pixels[:, 0].max() + 4, pixels[:, 1].mean() + 8), colour, 0.9)

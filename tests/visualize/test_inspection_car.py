@@ -11,7 +11,6 @@ import torch
 from directshape_torch.cli.demo import demo_dataset
 from directshape_torch.errors import InputError
 from directshape_torch.io.config_files import load_config
-from directshape_torch.observation.packing import pack_pixels
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.visualize.car_figures import CarCourse, iteration_frames, sampled_pixels_of
 from directshape_torch.visualize.drawing import BLUE, ORANGE, View, silhouette_mask
@@ -28,15 +27,14 @@ def course() -> CarCourse:
     return CarCourse(loaded, trace_refinement(refiner, loaded.frame, loaded.detections), _CAR)
 
 
-@pytest.mark.parametrize("side", ["left", "right"])
-def test_sampled_pixels_are_those_of_the_observation(course: CarCourse, side: str) -> None:
-    seen = pack_pixels(course.loaded.frame, course.loaded.detections, course.trace.config.sampling)
-    pixels = seen.left if side == "left" else seen.right
-    expected = pixels.uv[pixels.object_index == _CAR].long().numpy()
-    uv, _, mode = sampled_pixels_of(course, side)
-    assert {tuple(one) for one in uv.tolist()} == {tuple(uv) for uv in expected.tolist()}
-    # `fast` has evenly spaced pixels in the right image.
-    assert mode == ("adaptive" if side == "left" else "uniform")
+def test_sampled_pixels_are_those_of_the_cost_and_others_are_hidden(course: CarCourse) -> None:
+    """Car 6 is partly behind car 4 in the left image."""
+    assert sampled_pixels_of(course, "left")[1] == 0
+    behind = CarCourse(course.loaded, course.trace, 5)
+    uv, num_hidden = sampled_pixels_of(behind, "left")
+    of_cost = behind.trace.residuals(0)[5].silhouette_left.uv
+    assert {tuple(one) for one in uv.tolist()} == {tuple(one) for one in of_cost.astype(int).tolist()}
+    assert num_hidden > 10
 
 
 @pytest.mark.parametrize("number", [0, -1])

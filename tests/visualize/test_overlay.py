@@ -9,7 +9,7 @@ import torch
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Array, Picture, Surface, View
 from directshape_torch.visualize.drawn_car import DrawnCar
-from directshape_torch.visualize.overlay import Footprint, birds_eye_picture, overlay_picture
+from directshape_torch.visualize.overlay import draw_footprint, ground_view, overlay_picture
 
 P = np.array([[700.0, 0.0, 500.0, 0.0], [0.0, 700.0, 150.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
 # Two triangles a face would do as well for pictures: the outline is that of the convex hull.
@@ -59,17 +59,19 @@ def test_cars_in_odd_places_do_not_break_the_picture(z: float) -> None:
     assert has_colour(picture[30:300, :1000], ORANGE)
 
 
-def test_birds_eye_is_true_to_scale() -> None:
+def test_the_view_from_above_is_true_to_scale() -> None:
     square = np.array([[x, 0, z] for x, z in ((-2, 10), (2, 10), (2, 14), (-2, 14))], dtype=float)
-    picture = birds_eye_picture([Footprint(square, BLUE)], (800, 800))
-    rows, columns = np.nonzero(np.abs(picture.astype(int) - BLUE).max(axis=-1) < 30)
+    ground = ground_view(np.concatenate([np.zeros((1, 3)), square]), (800, 800))
+    draw_footprint(ground, square, BLUE)
+    rows, columns = np.nonzero(np.abs(ground.picture.astype(int) - BLUE).max(axis=-1) < 30)
     # From 3 m behind the camera to 3 m beyond the box: 20 m in 800 px.
     assert columns.max() - columns.min() == pytest.approx(4 * 40, abs=2)
     assert rows.max() - rows.min() == pytest.approx(4 * 40, abs=2)
     assert rows.max() == pytest.approx(799 - 13 * 40, abs=2)
 
 
-def test_birds_eye_leaves_far_truth_out_of_the_scale() -> None:
-    near, far = corners(0, 15), corners(0, 150)
-    with_far = birds_eye_picture([Footprint(near, BLUE), Footprint(far, GREEN, is_framed=False)], (400, 400))
-    np.testing.assert_array_equal(with_far, birds_eye_picture([Footprint(near, BLUE)], (400, 400)))
+def test_far_truth_is_left_out_of_the_scale() -> None:
+    plain = overlay_picture(image(), [car(0, 12, status=None)], [car(0, 12)])
+    with_far = overlay_picture(image(), [car(0, 12, status=None)], [car(0, 12)], [corners(0, 150)])
+    # Below the legend nothing moves.
+    np.testing.assert_array_equal(with_far[150:], plain[150:])
