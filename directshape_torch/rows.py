@@ -93,17 +93,6 @@ class OcclusionMap:
         covering = self.covering[torch.where(inside, first + v * step + u, 0)]
         return (covering < self.in_front[object_index]).any(dim=-1) & inside
 
-    def window(
-        self,
-        index: int,
-        region: tuple[int, int, int, int],  # u0, v0, u1, v1, half open
-    ) -> Tensor:
-        """Which pixels (v1 - v0, u1 - u0) of a region are hidden from one object, for pictures."""
-        u0, v0, u1, v1 = region
-        v, u = (torch.arange(*ends, device=self.crop.device) for ends in ((v0, v1), (u0, u1)))
-        uv = torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
-        return self.at(torch.full((), index, device=uv.device), uv)
-
 
 class Blocks(NamedTuple):
     """M blocks of B cars, a car's not necessarily side by side.

@@ -1,4 +1,4 @@
-"""What a refinement is given: ground planes, frames and detections, as plain tensors.
+"""What a refinement is given: frames and detections, as plain tensors.
 
 Knows no data set and no solver. Frames of a call are numbered `0 .. F-1`; objects carry the number of their frame.
 Everything is in the left camera frame (`cam`): x right, y down, z forward, metres; pixels are (u, v) = (column, row)
@@ -18,14 +18,15 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses
+from directshape_torch.geometry.ground_plane import GroundPlane
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.numerics.checks import (
     check_finite,
-    check_positive,
     check_rotation,
     check_rows,
     check_shape,
     check_type,
+    check_words,
     is_no_rotation,
 )
 from directshape_torch.numerics.records import Dense, TensorRecord
@@ -33,52 +34,14 @@ from directshape_torch.numerics.records import Dense, TensorRecord
 # Of B cars in an image: (B, H, W), or (H, W) and None for each.
 Masks = Tensor | Sequence[Tensor | None]
 
+MASK_THRESHOLD = 0.5
+"""Foreground probability above which an instance covers a pixel."""
+
 # Resampling by cubic kernels overshoots by a quarter at an edge; normalised images and 0..255 go far beyond.
 _BRIGHTEST = 1.5
 _DARKEST = -0.5
 # What times and places of a path must be told apart by.
 _FINE_S, _FINE_M = 1e-3, 0.01
-
-
-@dataclass(frozen=True)
-class GroundPlane(TensorRecord):
-    """One ground plane a frame: `normal . x_cam + offset = 0`, unit normal pointing up (negative y).
-
-    Attributes:
-        normal: (F, 3).
-        offset: (F,), metres; the height of the camera above the ground, negative where the plane is that of a hill
-            above it. NaN: cars of that frame fail.
-        source: where each plane came from, F entries: "file", "stereo", "camera_height", or the caller's own word.
-    """
-
-    normal: Annotated[Tensor, Dense("F", 3)]
-    offset: Annotated[Tensor, Dense("F")]
-    source: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_words("source", self.source, len(self.normal), "entries")
-        downwards = self.normal[:, 1] >= 0
-        not_unit = (self.normal.norm(dim=-1) - 1).abs() > 1e-3
-        # One wait for the device for both of them. NaN passes: it fails the cars of its own frame.
-        if bool((downwards | not_unit).any()):
-            check_rows("normal", downwards, self.normal, "a normal pointing up (negative y)", "flip the plane's signs")
-            check_rows("normal", not_unit, self.normal, "unit length", "divide the plane by its length")
-
-    @classmethod
-    def from_camera_height(cls, height_m: float, num_frames: int = 1) -> GroundPlane:
-        """A level ground `height_m` below the camera, for rigs without plane files.
-
-        Raises:
-            InputError: a height that is not above 0, or infinite.
-
-        Examples:
-            >>> GroundPlane.from_camera_height(1.65).offset
-            tensor([1.6500])
-        """
-        check_positive("height_m", height_m, "give the camera's height above the road, in metres")
-        normal = torch.tensor([[0.0, -1.0, 0.0]]).repeat(num_frames, 1)
-        return cls(normal, torch.full((num_frames,), float(height_m)), ("camera_height",) * num_frames)
 
 
 @dataclass(frozen=True)
@@ -118,7 +81,7 @@ class FrameBatch(TensorRecord):
         num_frames, _, height, width = self.images_left.shape
         _check_brightness("images_left", self.images_left)
         _check_brightness("images_right", self.images_right)
-        _check_words("frame_ids", self.frame_ids, num_frames, "names")
+        check_words("frame_ids", self.frame_ids, num_frames, "names")
         check_type("camera", self.camera, (StereoCamera,))
         check_type("ground", self.ground, (GroundPlane,))
         for name, count in (("camera", self.camera.num_frames), ("ground", len(self.ground.normal))):
@@ -387,7 +350,7 @@ def boxes_around(
     masks: Tensor,  # (B, H, W)
 ) -> Tensor:
     """u_min, v_min, u_max, v_max (B, 4) of the pixels above 0.5, float64; NaN without any."""
-    inside = masks if masks.dtype == torch.bool else masks > 0.5
+    inside = masks if masks.dtype == torch.bool else masks > MASK_THRESHOLD
     spans = []
     for axis in (1, 2):  # columns, then rows
         seen = inside.any(dim=axis).int()
@@ -395,13 +358,6 @@ def boxes_around(
         spans.append(torch.stack([first, last], dim=1).double())
     box = torch.stack(spans, dim=2).flatten(1)
     return torch.where(inside.flatten(1).any(dim=1)[:, None], box, torch.nan)
-
-
-def _check_words(name: str, words: object, count: int, what: str) -> None:
-    if not isinstance(words, (tuple, list)) or not all(isinstance(word, str) for word in words):
-        raise InputError(name, f"a tuple of {count} {what}", type(words).__name__)
-    if len(words) != count:
-        raise InputError(name, f"{count} {what}", f"{len(words)}")
 
 
 def _check_motion(time_s: Tensor | None, T_world_cam: Tensor | None) -> None:

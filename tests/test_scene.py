@@ -16,9 +16,10 @@ from directshape_torch.errors import (
     InputError,
 )
 from directshape_torch.geometry import se3
+from directshape_torch.geometry.ground_plane import GroundPlane
 from directshape_torch.geometry.projection import project
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.scene import GroundPlane, Occluders
+from directshape_torch.scene import Occluders
 from directshape_torch.status import Status
 
 

@@ -18,8 +18,8 @@ from directshape_torch.export.painted_cars import ground_grid
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.observation.extents import MASK_THRESHOLD
 from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.scene import MASK_THRESHOLD
 from directshape_torch.shape.zero_level import sdf_to_mesh
 from directshape_torch.stereo_matching.disparity import rgb8
 from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Colour

@@ -147,18 +147,11 @@ class DisparityField:
         """Measured minus true disparity, pixels, in the dtype of `uv_left`; beyond the hull that of its border."""
         return self.offsets(uv_left)[0]
 
-    def vertical(
-        self,
-        uv_left: Tensor,  # (*, 2) pixels of the full-resolution left image
-    ) -> Tensor:  # (*,)
-        """Measured minus predicted row in the right image, pixels; beyond the hull that of its nearest point."""
-        return self.offsets(uv_left)[1]
-
     def offsets(
         self,
         uv_left: Tensor,  # (*, 2) pixels of the full-resolution left image
     ) -> tuple[Tensor, Tensor]:  # (*,), (*,)
-        """`bias` and `vertical` in little more time than one of them."""
+        """`bias`, and measured minus predicted row in the right image; beyond the hull those of its border, pixels."""
         sizes = uv_left.shape[:-1] if isinstance(uv_left, Tensor) and not uv_left.is_nested else ()
         check_shape("uv_left", uv_left, (*sizes, 2), kind="floating")
         inside = nearest_in_convex_polygon(uv_left, self.hull_uv.to(uv_left))

@@ -16,6 +16,7 @@ from torch import Tensor
 from directshape_torch.errors import DirectShapeError, InputError, shown
 from directshape_torch.files.read_files import is_frame_id, read_lines
 from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.geometry.ground_plane import GroundPlane
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_detections import build_detections
 from directshape_torch.io.frame_layout import FrameFiles, FrameLayout, existing_folder, frames_among
@@ -27,7 +28,7 @@ from directshape_torch.io.layouts import folder_layout, object_layout, raw_layou
 from directshape_torch.io.mask_files import LayoutMasks
 from directshape_torch.io.track_association import associate
 from directshape_torch.io.velodyne import in_image, read_scan
-from directshape_torch.scene import Detections, FrameBatch, GroundPlane
+from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.stereo_matching.plane_from_points import estimate_ground_plane
 
 GroundSource = Literal["auto", "file", "stereo", "camera_height"]

@@ -95,6 +95,14 @@ def check_type(name: str, value: object, kinds: tuple[type, ...]) -> None:
         raise InputError(name, f"a {kinds[0].__name__}", type(value).__name__)
 
 
+def check_words(name: str, words: object, count: int, what: str) -> None:
+    """Raise `InputError` unless these are so many words, called `what`."""
+    if not isinstance(words, (tuple, list)) or not all(isinstance(word, str) for word in words):
+        raise InputError(name, f"a tuple of {count} {what}", type(words).__name__)
+    if len(words) != count:
+        raise InputError(name, f"{count} {what}", f"{len(words)}")
+
+
 def is_no_rotation(
     transform: Tensor,  # (N, 4, 4), finite
 ) -> Tensor:  # (N,) bool

@@ -9,10 +9,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.scene import Detections
-
-MASK_THRESHOLD = 0.5
-"""Foreground probability above which an instance covers a pixel."""
+from directshape_torch.scene import MASK_THRESHOLD, Detections
 
 # Resampling by cubic kernels overshoots by a quarter at an edge; logits and 0..255 go far beyond.
 _HIGHEST_PROBABILITY = 1.5

@@ -114,14 +114,11 @@ class PCAShapePrior(nn.Module):
         """The fields of B objects with codes (B, K): the basis collapses into one grid per object."""
         return GridShape(self.values(code), self.basis, self.origin, self.spacing_m)
 
-    def dimensions_hwl(self, code: Tensor) -> Tensor:
-        """Height, width and length (B, 3), metres, that codes (B, K) have by the linear map of the training cars."""
-        check_shape("code", code, ("B", self.num_codes))
-        return self.dimensions_mean_hwl + code @ self.dimensions_basis_hwl.T
-
     def dimensions_and_derivative(self, code: Tensor) -> DimensionsDerivative:
-        """`dimensions_hwl` with its constant derivative, (B, 3) and (B, 3, K)."""
-        return DimensionsDerivative(self.dimensions_hwl(code), self.dimensions_basis_hwl.expand(len(code), -1, -1))
+        """Height, width and length (B, 3), metres, by the linear map of the training cars, and its derivative."""
+        check_shape("code", code, ("B", self.num_codes))
+        hwl = self.dimensions_mean_hwl + code @ self.dimensions_basis_hwl.T
+        return DimensionsDerivative(hwl, self.dimensions_basis_hwl.expand(len(code), -1, -1))
 
     def save(self, path: Path | str, grid_dtype: torch.dtype = torch.float32) -> None:
         """Write a safetensors file, atomically; grids in `torch.float16` halve it and round by less than 1 mm."""

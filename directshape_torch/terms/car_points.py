@@ -10,9 +10,8 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry.projection import points_from_disparity
 from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.rows import PointSamples
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene import MASK_THRESHOLD, Detections, FrameBatch
 
-_MASK_THRESHOLD = 0.5
 # Above the ground plane: lower points are road, higher ones trees.
 _HEIGHTS_M = (0.1, 3.0)
 # Of the detection's centre, along the ground: a long car's half and what a detector is wrong by.
@@ -48,7 +47,8 @@ def car_points(frames: FrameBatch, detections: Detections, config: PointCloudCon
         camera.T_right_cam[frame],
         camera.disparity_field,
     )
-    passed = _passes(frames, detections, object_index, points_cam.detach()).nonzero()[:, 0]
+    passes = stands_at(frames, detections, object_index, points_cam.detach(), _REACH_M, _HEIGHTS_M)
+    passed = passes.nonzero()[:, 0]
     object_index, points_cam = object_index[passed], points_cam[passed]
     counts = occurrences(object_index, len(detections))
     kept = every_nth(object_index, counts, config.max_points)
@@ -62,7 +62,7 @@ def _pixels(frames: FrameBatch, d: Detections) -> Tensor:
     u_min, v_min, u_max, v_max = d.box_2d[:, :, None].unbind(1)
     rows, columns = frames.sizes[d.frame_index, :, None].unbind(1)
     in_box = _grid((v >= v_min) & (v <= v_max), (u >= u_min) & (u <= u_max))
-    chosen = torch.where(d.has_mask_left[:, None, None], d.mask_left > _MASK_THRESHOLD, in_box)
+    chosen = torch.where(d.has_mask_left[:, None, None], d.mask_left > MASK_THRESHOLD, in_box)
     # Whatever the padding of a smaller frame holds is no part of it.
     return chosen & _grid(v < rows, u < columns)
 
@@ -77,16 +77,22 @@ def _known(disparity: Tensor) -> Tensor:
     return disparity.isfinite() & (disparity > 0)
 
 
-def _passes(frames: FrameBatch, detections: Detections, object_index: Tensor, points_cam: Tensor) -> Tensor:
-    """Which points (P,) are above the ground and near the detection; NaN fails every comparison."""
-    frame = detections.frame_index[object_index]
+def stands_at(
+    frames: FrameBatch,
+    detections: Detections,
+    car: Tensor,  # (*,), that of each point, or what broadcasts to it
+    points_cam: Tensor,  # (*, 3)
+    reach_m: Tensor | float,  # of the detection's centre, along the ground
+    heights_m: tuple[float, float],
+) -> Tensor:
+    """Which points (*,) are above the ground and near their car; NaN fails every comparison."""
+    frame = detections.frame_index[car]
     normal = frames.ground.normal[frame]
     height = (normal * points_cam).sum(-1) + frames.ground.offset[frame]
-    offset = points_cam - detections.T_cam_obj[object_index, :3, 3]
+    offset = points_cam - detections.T_cam_obj[car, :3, 3]
     along_ground = offset - (offset * normal).sum(-1, keepdim=True) * normal
-    near: Tensor = along_ground.norm(dim=-1) <= _REACH_M
-    lowest, highest = _HEIGHTS_M
-    return near & (height >= lowest) & (height <= highest)
+    near: Tensor = along_ground.norm(dim=-1) <= reach_m
+    return near & (height >= heights_m[0]) & (height <= heights_m[1])
 
 
 def every_nth(object_index: Tensor, counts: Tensor, most: int) -> Tensor:

@@ -12,18 +12,16 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry.projection import project
 from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.rows import PointSamples
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene import MASK_THRESHOLD, Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.terms.car_points import every_nth
+from directshape_torch.terms.car_points import every_nth, stands_at
 from directshape_torch.terms.cars import CarBatch
 from directshape_torch.terms.point_cloud import PointCloud
 
-_MASK_THRESHOLD = 0.5
 # A detector's error in place, beyond which a point belongs to something else.
 _BEYOND_BOX_M = 1.0
 # Above the ground plane, whose own error is 0.05 m: lower points are road.
-_LEAST_HEIGHT_M = 0.15
-_GREATEST_HEIGHT_M = 3.0
+_HEIGHTS_M = (0.15, 3.0)
 # Fewer may all be of a pole or of a car behind, and would weigh as much as hundreds.
 _LEAST_POINTS = 10
 _MOST_POINTS = 1000
@@ -70,7 +68,9 @@ def lidar_points(frames: FrameBatch, detections: Detections, rows: Tensor) -> Po
         raise InputError("frames.points_cam", "LiDAR points of each frame", "None", cure)
     frame = detections.frame_index[rows]
     points = frames.points_cam.detach()[frame]
-    belongs = _in_mask(frames, detections, rows, points) & _within_reach(frames, detections, rows, points)
+    reach = 0.5 * detections.dimensions_hwl[rows, 1:].norm(dim=-1, keepdim=True) + _BEYOND_BOX_M
+    belongs = _in_mask(frames, detections, rows, points)
+    belongs = belongs & stands_at(frames, detections, rows[:, None], points, reach, _HEIGHTS_M)
     car, number = belongs.nonzero(as_tuple=True)
     counts = occurrences(car, len(rows))
     kept = every_nth(car, counts, _MOST_POINTS)
@@ -85,20 +85,8 @@ def _in_mask(frames: FrameBatch, detections: Detections, rows: Tensor, points_ca
     column, row = uv.nan_to_num(-1.0).round().clamp(-1, max(frames.images_left.shape[2:])).long().unbind(-1)
     seen = (points_cam[..., 2] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     column, row = (torch.where(seen, x, torch.zeros_like(x)) for x in (column, row))
-    masked = detections.mask_left[rows[:, None], row, column] > _MASK_THRESHOLD
+    masked = detections.mask_left[rows[:, None], row, column] > MASK_THRESHOLD
     u_min, v_min, u_max, v_max = detections.box_2d[rows, :, None].unbind(1)
     u, v = uv.unbind(-1)
     in_box = (u >= u_min) & (u <= u_max) & (v >= v_min) & (v <= v_max)
     return seen & torch.where(detections.has_mask_left[rows, None], masked, in_box)
-
-
-def _within_reach(frames: FrameBatch, detections: Detections, rows: Tensor, points_cam: Tensor) -> Tensor:
-    """Which points (B, P) are above the ground and near their car."""
-    frame = detections.frame_index[rows]
-    normal = frames.ground.normal[frame, None]
-    height = (normal * points_cam).sum(-1) + frames.ground.offset[frame, None]
-    offset = points_cam - detections.T_cam_obj[rows, None, :3, 3]
-    along_ground = offset - (offset * normal).sum(-1, keepdim=True) * normal
-    reach = 0.5 * detections.dimensions_hwl[rows, 1:].norm(dim=-1, keepdim=True) + _BEYOND_BOX_M
-    near: Tensor = along_ground.norm(dim=-1) <= reach
-    return near & (height >= _LEAST_HEIGHT_M) & (height <= _GREATEST_HEIGHT_M)

@@ -7,9 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from directshape_torch.observation.extents import MASK_THRESHOLD
 from directshape_torch.observation.occlusion import OcclusionOrder, Side
-from directshape_torch.scene import Detections
+from directshape_torch.scene import MASK_THRESHOLD, Detections
 
 
 def instances_in_front(detections: Detections, side: Side, order: OcclusionOrder = "depth") -> Tensor:

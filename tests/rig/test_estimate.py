@@ -57,7 +57,7 @@ def test_where_nothing_is_known_rectification_leaves_some_tenths_of_a_pixel() ->
 def test_a_single_car_moves_the_rows_of_the_middle() -> None:
     """By its own 0.02 px less what a prior of 0.4 px says against 0.1 px of noise."""
     middle = torch.tensor([[0.5 * SIZE_WH[0], 0.5 * SIZE_WH[1], 20.0, 0.0, 0.05, 0.02, 0.0, 0.0]], dtype=torch.float64)
-    assert float(estimate(middle).field.vertical(middle[:, :2])) == pytest.approx(0.02 * 0.95, rel=0.02)
+    assert float(estimate(middle).field.offsets(middle[:, :2])[1]) == pytest.approx(0.02 * 0.95, rel=0.02)
 
 
 def test_a_biased_detector_leaves_the_field_unharmed() -> None:
@@ -66,7 +66,7 @@ def test_a_biased_detector_leaves_the_field_unharmed() -> None:
     mean, sigma = rig.offset_at(PLACES)
     assert bool(((mean - true_offset(PLACES)).abs() < 2.5 * sigma).all())
     assert float(sigma.max()) < 0.25
-    assert float(rig.field.vertical(PLACES).mean()) == pytest.approx(0.2, abs=0.05)
+    assert float(rig.field.offsets(PLACES)[1].mean()) == pytest.approx(0.2, abs=0.05)
 
 
 def test_order_and_portions_do_not_matter_to_the_bit() -> None:

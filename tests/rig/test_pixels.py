@@ -58,7 +58,7 @@ def test_fit_recovers_the_field_under_a_fifth_of_wrong_matches_on_one_side() -> 
     field = fitted(observations(4000, outliers=0.2)).field
     error = field.bias(image_grid()) - polynomial_basis(image_grid(), SIZE) @ TRUE
     assert float(error.abs().mean()) < 0.03
-    rows = field.vertical(image_grid()) - polynomial_basis(image_grid(), SIZE) @ TRUE_VERTICAL
+    rows = field.offsets(image_grid())[1] - polynomial_basis(image_grid(), SIZE) @ TRUE_VERTICAL
     assert float(rows.abs().mean()) < 0.03
 
 

@@ -105,7 +105,7 @@ def test_motion_and_road_find_the_field_beside_things_that_move() -> None:
     assert result.converged
     assert result.sigma_px is not None
     assert result.sigma_px < 0.05
-    rows = field.vertical(grid())
+    rows = field.offsets(grid())[1]
     torch.testing.assert_close(rows, torch.full_like(rows, 0.2), atol=0.01, rtol=0)
 
 

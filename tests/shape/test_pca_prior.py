@@ -72,7 +72,7 @@ def test_linear_dimensions_follow_the_zero_level(prior):
     code = torch.tensor([[0.0, 0, 0, 0], [0.7, -0.5, 0, 0], [-1.0, 0.4, 0, 0]], dtype=torch.float64)
     extents = zero_level_extents(prior.values(code), prior.origin, prior.spacing_m)
     measured = (extents[:, 1] - extents[:, 0])[:, [1, 2, 0]]
-    torch.testing.assert_close(prior.dimensions_hwl(code), measured, atol=0.06, rtol=0)
+    torch.testing.assert_close(prior.dimensions_and_derivative(code).hwl, measured, atol=0.06, rtol=0)
 
 
 def test_state_dict_and_dtype(prior, samples):

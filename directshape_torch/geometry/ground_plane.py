@@ -1,0 +1,53 @@
+"""Ground planes of frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from directshape_torch.numerics.checks import check_positive, check_rows, check_words
+from directshape_torch.numerics.records import Dense, TensorRecord
+
+
+@dataclass(frozen=True)
+class GroundPlane(TensorRecord):
+    """One ground plane a frame: `normal . x_cam + offset = 0`, unit normal pointing up (negative y).
+
+    Attributes:
+        normal: (F, 3).
+        offset: (F,), metres; the height of the camera above the ground, negative where the plane is that of a hill
+            above it. NaN: cars of that frame fail.
+        source: where each plane came from, F entries: "file", "stereo", "camera_height", or the caller's own word.
+    """
+
+    normal: Annotated[Tensor, Dense("F", 3)]
+    offset: Annotated[Tensor, Dense("F")]
+    source: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_words("source", self.source, len(self.normal), "entries")
+        downwards = self.normal[:, 1] >= 0
+        not_unit = (self.normal.norm(dim=-1) - 1).abs() > 1e-3
+        # One wait for the device for both of them. NaN passes: it fails the cars of its own frame.
+        if bool((downwards | not_unit).any()):
+            check_rows("normal", downwards, self.normal, "a normal pointing up (negative y)", "flip the plane's signs")
+            check_rows("normal", not_unit, self.normal, "unit length", "divide the plane by its length")
+
+    @classmethod
+    def from_camera_height(cls, height_m: float, num_frames: int = 1) -> GroundPlane:
+        """A level ground `height_m` below the camera, for rigs without plane files.
+
+        Raises:
+            InputError: a height that is not above 0, or infinite.
+
+        Examples:
+            >>> GroundPlane.from_camera_height(1.65).offset
+            tensor([1.6500])
+        """
+        check_positive("height_m", height_m, "give the camera's height above the road, in metres")
+        normal = torch.tensor([[0.0, -1.0, 0.0]]).repeat(num_frames, 1)
+        return cls(normal, torch.full((num_frames,), float(height_m)), ("camera_height",) * num_frames)
