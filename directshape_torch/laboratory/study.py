@@ -9,7 +9,7 @@ import torch
 
 from directshape_torch.errors import InputError
 from directshape_torch.laboratory.bench import TERM_NAMES, TRACK_NAMES, Bench
-from directshape_torch.laboratory.comparison import Comparison, compare
+from directshape_torch.laboratory.comparison import BOUNDS, Comparison, compare
 from directshape_torch.laboratory.experiments import AT_FIXED_DEPTHS, FACTORS, gradient_experiment, term_experiment
 from directshape_torch.laboratory.regimes import Regime, checked_name, regimes_named
 from directshape_torch.laboratory.scenes import LaboratoryScene
@@ -100,9 +100,7 @@ def compare_subjects(bench: Bench, names: Sequence[str], second: bool = False) -
 def _in_a_line(found: Sequence[Comparison]) -> str:
     if not found:
         return "nothing to compare"
-    worst = {
-        pair: max(found, key=lambda c: c.errors[pair].maximum) for pair in ("analytic-autograd", "analytic-numeric")
-    }
-    errors = ", ".join(f"{pair} at most {c.errors[pair].maximum:.0e} ({c.name})" for pair, c in worst.items())
+    worst = {pair: max(found, key=lambda c: c.errors[pair]) for pair in BOUNDS}
+    errors = ", ".join(f"{pair} at most {c.errors[pair]:.0e} ({c.name})" for pair, c in worst.items())
     excluded = sum(sum(c.excluded.values()) for c in found) / max(1, sum(c.entries for c in found))
     return f"{errors}, {100 * excluded:.2f} % excluded"
