@@ -162,8 +162,7 @@ def test_a_mask_in_one_image_only_is_enough(side: str) -> None:
     assert (result.cost_after.sum(1) < result.cost_before.sum(1)).all()
 
 
-@pytest.mark.parametrize("config", [DEFAULT, PAPER])
-@pytest.mark.parametrize("side", ["images_left", "images_right"])
+@pytest.mark.parametrize(("side", "config"), [("images_left", PAPER), ("images_right", DEFAULT)])
 def test_a_nan_image_fails_its_own_frame_only(side: str, config: RefinerConfig) -> None:
     first = cached_street()[1]
     second = street(ellipsoid_prior(), [(0.5, 1.65, 9.0)], [0.8])

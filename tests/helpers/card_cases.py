@@ -35,25 +35,27 @@ from helpers.problems import DEFAULT
 from helpers.synthetic_scene import disturbed
 
 _SHIPPED = load_config("default", ["compile=off"])
+# What two iterations do, all do; `default` goes on until cars leave.
+_FEW_STEPS = replace(DEFAULT, stages=tuple(replace(stage, max_iterations=2) for stage in DEFAULT.stages))
 _SIGMAS = {"pose_sigma_along_m": 0.5, "pose_sigma_across_m": 0.3, "pose_sigma_vertical_m": 0.2}
 
 SETTINGS: dict[str, RefinerConfig] = {
     "default": _SHIPPED,
     "product form, marched rays, search": with_solver(
         replace(
-            DEFAULT,
+            _FEW_STEPS,
             silhouette=replace(DEFAULT.silhouette, form="product"),
             search=replace(DEFAULT.search, disparity_offsets_px=(-1.0, 1.0)),
         ),
         rays="marched",
     ),
-    "point cloud": replace(DEFAULT, method="geometric"),
+    "point cloud": replace(DEFAULT, method="geometric", point_cloud=replace(DEFAULT.point_cloud, rounds=2)),
     "implicit gradients": replace(DEFAULT, backward=replace(DEFAULT.backward, mode="implicit")),
 }
 
 OTHER_FORMS = with_solver(
     replace(
-        DEFAULT,
+        _FEW_STEPS,
         photometric=replace(
             DEFAULT.photometric, patch="normalised", brightness="affine", truncated=True, pixel_set="hit"
         ),
@@ -64,7 +66,7 @@ OTHER_FORMS = with_solver(
     accept_every_step=True,
 )
 # Of views of tracks as well as of cars by themselves.
-UNROLLED = replace(DEFAULT, backward=replace(DEFAULT.backward, mode="unroll"))
+UNROLLED = replace(_FEW_STEPS, backward=replace(DEFAULT.backward, mode="unroll"))
 
 
 def compare(config: RefinerConfig, prior: ShapePrior | None = None, tracks: bool = False) -> dict[str, float]:
