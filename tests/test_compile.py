@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from benchmark_suites.workloads import demo_scene, with_cars
 from helpers.compiled_lookup import (
     Nearest,
     graphs,
@@ -28,11 +27,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from directshape_torch import compile as compile_module
 from directshape_torch.compile import CARS_WORTH_COMPILING, Compilable, cars_ahead, compiling, num_forms, will_compile
 from directshape_torch.errors import CompilationError
-from directshape_torch.io.config_files import load_config
-from directshape_torch.refinement.disparity_profile import shifted_costs
-from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.terms.depth import marched_views
-from directshape_torch.terms.term import parts_of
 
 pytestmark = pytest.mark.usefixtures("fresh_compiler_counts")
 
@@ -135,20 +129,6 @@ class TestForms:
         assert len(results) == 3
         assert all(torch.equal(result, results[0]) for result in results)
         assert graphs() == 1
-
-    def test_other_numbers_of_cars_and_pixels_compile_nothing_anew(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        functions = (marched_views, parts_of, shifted_costs)
-        for function in functions:
-            monkeypatch.setattr(function, "_compiled", None)
-            monkeypatch.setattr(function, "_has_worked", False)
-        torch.compiler.reset()
-        stages = "stages=[{contour_width_px: 2.0, image_level: 1, max_iterations: 2}, {max_iterations: 2}]"
-        more, fewer = (load_config(None, ["compile=on", stages, f"sampling.max_pixels={n}"]) for n in (900, 450))
-        for config, num_cars in ((more, 3), (fewer, 2), (fewer, 8)):
-            result = DirectShapeRefiner(config=config)(*with_cars(demo_scene().frames, num_cars))
-            assert len(result.status) == num_cars
-            assert graphs() == len(functions)
-        torch.compiler.reset()
 
 
 @pytest.mark.usefixtures("_traced")

@@ -12,16 +12,19 @@ from typing import Any
 import pytest
 import torch
 from benchmark_suites.workloads import demo_scene, with_cars
-from helpers.compiled_lookup import needs_compiler
+from helpers.compiled_lookup import graphs, needs_compiler
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
-from directshape_torch.compile import Compilable
+from directshape_torch.compile import Compilable, compiler_problem
 from directshape_torch.io.config_files import load_config
 from directshape_torch.refiner import DirectShapeRefiner
 
 # Two iterations, so that the second one follows what the first has found.
-FEW_STEPS = ("compile=on", "stages=[{contour_width_px: 2.0, image_level: 1, max_iterations: 2}]")
+FEW_STEPS = (
+    "compile=on",
+    "stages=[{contour_width_px: 2.0, image_level: 1, max_iterations: 2}, {max_iterations: 2}]",
+)
 
 # For each output the axes of its components, which are quantities of their own.
 SUMS: list[tuple[int, ...]] = [(), (1, 2), (1, 2), (1, 2)]  # cost, products, information, residual of a term
@@ -47,13 +50,10 @@ def _two_threads() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-# A rig whose disparity may be off is another compilation of the terms, and of them alone.
 @needs_compiler
-@pytest.mark.parametrize(("num_cars", "sigma_px"), [(5, 0.5), (40, 0)])
-@pytest.mark.usefixtures("_two_threads")
-def test_compiled_functions_compute_what_they_compute_plainly(
-    num_cars: int, sigma_px: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("_two_threads", "fresh_compiler_counts")
+def test_compiled_functions_compute_what_they_compute_plainly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each is compiled once for all numbers of cars and pixels; of a rig without an offset the terms are another."""
     wrong: dict[str, set[str]] = {}
     run_compiled = Compilable._run
 
@@ -65,10 +65,15 @@ def test_compiled_functions_compute_what_they_compute_plainly(
         wrong.setdefault(name, set()).update(differences(name, found, expected))
         return found
 
+    assert compiler_problem() is None
+    traced = graphs()  # of that question
     monkeypatch.setattr(Compilable, "_run", compare)
-    config = load_config(None, [*FEW_STEPS, f"rig.disparity_sigma_px={sigma_px}"])
-    DirectShapeRefiner(config=config)(*with_cars(demo_scene().frames, num_cars))
-    assert wrong == {name: set() for name in COMPONENT_AXES}
+    for number_of_forms, num_cars, max_pixels, sigma_px in ((3, 5, 900, 0.5), (3, 3, 450, 0.5), (4, 40, 900, 0)):
+        changes = f"rig.disparity_sigma_px={sigma_px}", f"sampling.max_pixels={max_pixels}"
+        refiner = DirectShapeRefiner(config=load_config(None, [*FEW_STEPS, *changes]))
+        refiner(*with_cars(demo_scene().frames, num_cars))
+        assert wrong == {name: set() for name in COMPONENT_AXES}
+        assert graphs() - traced == number_of_forms
 
 
 def differences(name: str, found: object, expected: object) -> Iterator[str]:
