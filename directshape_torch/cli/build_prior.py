@@ -18,10 +18,9 @@ from directshape_torch.errors import DataFormatError, InputError, MeshError
 from directshape_torch.files import atomic_files
 from directshape_torch.files.mesh_files import MESH_SUFFIXES
 from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
-from directshape_torch.shape.pca_fit import fit_pca
+from directshape_torch.shape.pca_fit import fit_pca, leave_one_out_errors_cm
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.prior_file import PriorProvenance
-from directshape_torch.shape.prior_quality import leave_one_out_errors_cm
 
 REPORT_SCHEMA = "directshape_torch.prior_report/1"
 

@@ -48,10 +48,6 @@ class Observability(CarRecord):
     directions: Annotated[Tensor, Dense("B", 7, 7)]
     viewing_angle_rad: Annotated[Tensor, Dense("B")]
 
-    def scaled(self, factor: float) -> Observability:
-        """The same directions with all standard deviations multiplied by a factor."""
-        return Observability(factor * self.sigmas_m, self.directions, self.viewing_angle_rad)
-
     def words(self) -> list[str]:
         """The weakest direction of each car, largest part first; empty for cars that were not refined.
 

@@ -132,6 +132,7 @@ def outcome_of(
     seen = stage.information_of_measurements(after)
     if seen is not None:
         seen = without_offset(problem.sharing.with_others(seen, refined), num_kept)
+    unseen = observability_of(problem.prior, end, seen)
     found = replace(
         came,
         status_code=minimum.status,
@@ -143,7 +144,7 @@ def outcome_of(
         covariance=covariance,
         covariance_xyz_yaw=covariance_xyz_yaw(covariance, end.T_obj_cam),
         # The directions are mostly those of the depth, so its factor brings them to size.
-        observability=observability_of(problem.prior, end, seen).scaled(bundled_trust_model().sigma_factors[0]),
+        observability=replace(unseen, sigmas_m=bundled_trust_model().sigma_factors[0] * unseen.sigmas_m),
         profile=disparity_profile(stage.photometric, at_input, at_end, len(cars), end.code),
     )
     evidence = evidence_of_motion(problem, cars, initial, end, covariance, found.covariance_xyz_yaw)

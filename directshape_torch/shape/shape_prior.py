@@ -7,7 +7,7 @@ the object frame: x forward, y down, origin on the ground under the box centre.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol
 
 from torch import Tensor
 
@@ -27,7 +27,6 @@ class DimensionsDerivative(NamedTuple):
     J_hwl_code: Tensor  # (B, 3, K) metres per standard deviation
 
 
-@runtime_checkable
 class BoundShape(Protocol):
     """Signed distance fields of B objects whose codes are fixed."""
 
@@ -48,7 +47,6 @@ class BoundShape(Protocol):
         ...
 
 
-@runtime_checkable
 class ShapePrior(Protocol):
     """A family of shapes with a whitened code: component k has standard deviation 1.
 
