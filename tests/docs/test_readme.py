@@ -54,17 +54,6 @@ def test_each_marked_command_is_one_shell_line(name: str) -> None:
     assert command.startswith("python3 -m venv")
 
 
-def test_every_relative_link_leads_to_a_heading_of_a_file() -> None:
-    links = re.findall(r"\]\((?!https?://)([^)]+)\)", README)
-
-    assert links
-    for link in links:
-        name, _, anchor = link.partition("#")
-        text = (ROOT / name).read_bytes() if name else README.encode()
-        headings = re.findall(r"^#+ (.+)$", text.decode(errors="ignore"), re.MULTILINE)
-        assert not anchor or anchor in {re.sub(r"[^\w -]", "", h).lower().replace(" ", "-") for h in headings}, link
-
-
 def test_every_figure_of_the_results_is_in_the_docs() -> None:
     table = README[README.index("## Results") : README.index("## Limits")]
     figures = re.findall(r"\b0\.\d{3}\b", table)
