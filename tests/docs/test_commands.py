@@ -1,4 +1,4 @@
-"""Every command in README and docs is understood by the program."""
+"""Every command in README and docs is understood by the program, and so are its settings."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from directshape_torch.cli.main import make_parser
+from directshape_torch.io.config_files import load_config
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -31,4 +32,5 @@ def test_commands_are_found() -> None:
 
 @pytest.mark.parametrize("command", ALL)
 def test_each_command_is_understood(command: str) -> None:
-    make_parser().parse_args(shlex.split(command, comments=True))
+    args = make_parser().parse_args(shlex.split(command, comments=True))
+    load_config(None, getattr(args, "set", None) or [])
