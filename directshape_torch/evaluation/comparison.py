@@ -113,14 +113,18 @@ def compare_results(
     frame_ids = _frames_of(*sources[1:]) if named is None else named
     if not frame_ids:
         raise InputError("frames", f"at least one frame; result files NNNNNN.txt in {before_dir}", "none")
-    pairs: list[_Pair] = []
-    num_counted = num_found = 0
+    cars: list[ComparedCar] = []
+    num_counted = num_left_out = 0
     for frame_id in frame_ids:
-        found, count = _pairs_of_frame(sources, frame_id)
-        num_found += len(found)
+        found, count = _cars_of_frame(sources, frame_id)
         num_counted += count
-        pairs += found if shapes_dir is None else _with_left_mask(found, Path(shapes_dir) / f"{frame_id}.npz")
-    cars = _compared_cars(pairs)
+        if shapes_dir is not None:
+            shapes = read_shapes(Path(shapes_dir) / f"{frame_id}.npz")
+            with_mask = shapes.input_lines[shapes.has_mask_left].tolist()
+            num_left_out += len(found)
+            found = [car for car in found if car.detection_line in with_mask]
+            num_left_out -= len(found)
+        cars += found
     by_depth = {
         f"{low:.0f}-{high:.0f} m" if high < float("inf") else f"over {low:.0f} m": [
             car for car in cars if low <= car.depth_m < high
@@ -128,12 +132,12 @@ def compare_results(
         for low, high in pairwise(_DEPTH_BINS_M)
     }
     return Comparison(
-        cars=cars,
+        cars=tuple(cars),
         overall=_summarised("all detections", cars, num_draws, seed),
         by_depth=tuple(_summarised(name, some, num_draws, seed) for name, some in by_depth.items()),
         num_frames=len(frame_ids),
         num_labels_counted=num_counted,
-        num_filtered_out=num_found - len(pairs),
+        num_filtered_out=num_left_out,
     )
 
 
@@ -151,13 +155,6 @@ def _summarised(name: str, cars: Sequence[ComparedCar], num_draws: int, seed: in
     return GroupSummary(name, len(cars), metrics, bootstrap.estimate(worse))
 
 
-class _Pair(NamedTuple):
-    frame_id: str
-    label: KittiObject
-    before: KittiObject
-    after: KittiObject
-
-
 def _frames_of(before: Path, after: Path) -> tuple[str, ...]:
     """Of the files of `before`; of a sequence, and of a single file, those that `after` has."""
     results = files_of_frames(after)
@@ -169,7 +166,7 @@ def _frames_of(before: Path, after: Path) -> tuple[str, ...]:
     return tuple(frame for stem in files_of_frames(before) for frame in of_sequence.get(stem, [stem]))
 
 
-def _pairs_of_frame(sources: tuple[Path, Path, Path], frame_id: str) -> tuple[list[_Pair], int]:
+def _cars_of_frame(sources: tuple[Path, Path, Path], frame_id: str) -> tuple[list[ComparedCar], int]:
     """Counted labels of a frame that have a detection, and the number of those that count at all."""
     label_path, before_path, after_path = (objects_path(source, frame_id) for source in sources)
     labels = objects_in(label_path, frame_id)
@@ -180,8 +177,23 @@ def _pairs_of_frame(sources: tuple[Path, Path, Path], frame_id: str) -> tuple[li
     _check_same_lines(before_path, before, after_path, after)
     lines = [pair for pair in zip(before, after, strict=True) if pair[0].type == "Car" and pair[0].has_box_3d]
     found = match_to_labels([old for old, _ in lines], labels)
-    pairs = [_Pair(frame_id, label, *lines[row]) for row, label in found.items() if is_counted(label)]
-    return pairs, sum(is_counted(label) for label in labels)
+    label_of = {row: label for row, label in found.items() if is_counted(label)}
+    sides = ([lines[row][side] for row in label_of] for side in (0, 1))
+    errors = [errors_of(objects, list(label_of.values())) for objects in sides]
+    cars = [
+        ComparedCar(
+            frame_id=frame_id,
+            detection_line=lines[row][0].line_number,
+            label_line=label.line_number,
+            depth_m=label.location_ref[2],
+            height_px=label.box_2d[3] - label.box_2d[1],
+            score=lines[row][0].score,
+            before=before,
+            after=after,
+        )
+        for (row, label), before, after in zip(label_of.items(), *errors, strict=True)
+    ]
+    return cars, sum(is_counted(label) for label in labels)
 
 
 def _check_same_lines(
@@ -194,27 +206,3 @@ def _check_same_lines(
         if old.type != new.type or (old.has_box_3d and not new.has_box_3d):
             problem = f"does not belong to line {old.line_number} of {before_path} ({old.raw_line!r})"
             raise DataFormatError(after_path, problem, line_number=new.line_number, line=new.raw_line, cure=cure)
-
-
-def _with_left_mask(pairs: Sequence[_Pair], path: Path) -> list[_Pair]:
-    shapes = read_shapes(path)
-    lines = set(shapes.input_lines[shapes.has_mask_left].tolist())
-    return [pair for pair in pairs if pair.before.line_number in lines]
-
-
-def _compared_cars(pairs: Sequence[_Pair]) -> tuple[ComparedCar, ...]:
-    labels = [pair.label for pair in pairs]
-    before, after = (errors_of([getattr(pair, when) for pair in pairs], labels) for when in ("before", "after"))
-    return tuple(
-        ComparedCar(
-            frame_id=pair.frame_id,
-            detection_line=pair.before.line_number,
-            label_line=pair.label.line_number,
-            depth_m=pair.label.location_ref[2],
-            height_px=pair.label.box_2d[3] - pair.label.box_2d[1],
-            score=pair.before.score,
-            before=errors_before,
-            after=errors_after,
-        )
-        for pair, errors_before, errors_after in zip(pairs, before, after, strict=True)
-    )
