@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 import torch
-from benchmark_suites.workloads import demo_scene, with_cars
+from benchmark_suites.workloads import demo_scene
+from helpers.car_counts import with_cars
 from helpers.compiled_lookup import graphs, needs_compiler
 from torch import Tensor
 from torch.utils._pytree import tree_leaves

@@ -1,17 +1,14 @@
-"""What is refined: scenes, and calls of any number of cars made from one frame."""
+"""What is refined: frames with cars."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import directshape_torch
 from directshape_torch.errors import InputError
-from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.scene import Detections, FrameBatch
 
 _DETECTORS = {"rendered": "stereo", "kitti": "noisy_stereo"}
 
@@ -61,32 +58,3 @@ def _scene(root: Path, detector: str, max_frames: int | None) -> Scene:
     loaded = (dataset.load(frame_id) for frame_id in dataset.frame_ids)
     with_cars = (frame for frame in loaded if len(frame.detections))
     return Scene(root.name, tuple(itertools.islice(with_cars, max_frames)))
-
-
-def with_cars(frames: Sequence[LoadedFrame], num_cars: int) -> tuple[FrameBatch, Detections]:
-    """One call of exactly so many cars: the frames over and over, of the last one its first cars.
-
-    Raises:
-        InputError: no cars to repeat.
-    """
-    if not sum(len(frame.detections) for frame in frames):
-        raise InputError("frames", "at least one car", "none")
-    chosen: list[LoadedFrame] = []
-    missing = num_cars
-    while missing > 0:
-        loaded = frames[len(chosen) % len(frames)]
-        chosen.append(first_cars(loaded, min(missing, len(loaded.detections))))
-        missing -= len(chosen[-1].detections)
-    return collate(chosen)
-
-
-def first_cars(loaded: LoadedFrame, count: int) -> LoadedFrame:
-    """A frame of which only the first cars are refined; the others are not there, so that they hide nothing either."""
-    return replace(loaded, detections=_rows(loaded.detections, slice(0, count)))
-
-
-def _rows(detections: Detections, rows: slice) -> Detections:
-    names = ("frame_index", "T_cam_obj", "dimensions_hwl", "box_2d", "score", "mask_left", "mask_right")
-    kept = {name: getattr(detections, name)[rows] for name in (*names, "has_mask_left", "has_mask_right")}
-    sigma = None if detections.pose_sigma is None else detections.pose_sigma[rows]
-    return replace(detections, pose_sigma=sigma, **kept)

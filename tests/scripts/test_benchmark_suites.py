@@ -13,9 +13,8 @@ from benchmark_suites import checkouts, stage_profile, times
 from benchmark_suites.measures import count_operations, peak_tensor_bytes
 from benchmark_suites.stage_profile import PARTS, profile_parts
 from benchmark_suites.timing import Row, Spread, time_interleaved
-from benchmark_suites.workloads import demo_scene, first_cars, with_cars
-
-from directshape_torch.errors import InputError
+from benchmark_suites.workloads import demo_scene
+from helpers.car_counts import first_cars
 
 
 class FakeClock:
@@ -68,15 +67,6 @@ def test_each_side_is_timed_by_itself_in_an_order_that_turns_round(monkeypatch: 
 
     assert time_interleaved({name: side(name) for name in took}, 3) == {"slow": 3.0, "fast": 0.5}
     assert called == ["slow", "fast", "slow", "fast", "fast", "slow", "slow", "fast"]
-
-
-@pytest.mark.parametrize(("count", "frames"), [(1, 1), (7, 2), (20, 4)])
-def test_exactly_so_many_cars_in_as_few_frames_as_hold_them(count: int, frames: int) -> None:
-    batch, detections = with_cars(demo_scene().frames, count)
-    assert (len(detections), len(batch)) == (count, frames)
-    assert torch.equal(detections.frame_index, torch.arange(count) // 6)
-    with pytest.raises(InputError, match="at least one car"):
-        with_cars([first_cars(demo_scene().frames[0], 0)], count)
 
 
 def test_times_are_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

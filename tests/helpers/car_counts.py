@@ -1,0 +1,30 @@
+"""Calls of any number of cars."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+from torch import Tensor
+
+from directshape_torch.io.frame_collation import collate
+from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.scene import Detections, FrameBatch
+
+
+def with_cars(frames: Sequence[LoadedFrame], num_cars: int) -> tuple[FrameBatch, Detections]:
+    """One call of exactly so many cars: the frames over and over, of the last one its first cars."""
+    chosen: list[LoadedFrame] = []
+    missing = num_cars
+    while missing > 0:
+        loaded = frames[len(chosen) % len(frames)]
+        chosen.append(first_cars(loaded, min(missing, len(loaded.detections))))
+        missing -= len(chosen[-1].detections)
+    return collate(chosen)
+
+
+def first_cars(loaded: LoadedFrame, count: int) -> LoadedFrame:
+    """A frame of which only the first cars are refined; the others are not there, so that they hide nothing either."""
+    given = {each.name: getattr(loaded.detections, each.name) for each in fields(Detections)}
+    kept = {name: value[:count] for name, value in given.items() if isinstance(value, Tensor)}
+    return replace(loaded, detections=replace(loaded.detections, **kept))
