@@ -10,7 +10,7 @@ import torch
 
 from directshape_torch.batch.fit_shape import ShapeFit, fit_shape
 from directshape_torch.batch.frame_outputs import refined_boxes, write_meshes
-from directshape_torch.files import atomic_files
+from directshape_torch.files.array_files import write_npz
 from directshape_torch.geometry.box_formats import poses_to_boxes
 from directshape_torch.io.kitti_labels import poses_cam
 from directshape_torch.io.result_files import write_result_text
@@ -43,6 +43,6 @@ def fit_scan(dataset: StereoDataset, frame_id: str, out_dir: Path, prior: ShapeP
     cars = replace(fit.cars, t_cam_ref=camera.t_cam_ref.expand(len(rows), 3))
     write_result_text(result_path(out_dir, frame_id), objects, refined_boxes(cars.boxes(), cars.refined, rows))
     numbers = np.array([each.line_number for each in chosen], dtype=np.int64)
-    atomic_files.write_npz(shapes_path(out_dir, frame_id), fit.arrays("cam", input_lines=numbers))
+    write_npz(shapes_path(out_dir, frame_id), fit.arrays("cam", input_lines=numbers))
     write_meshes(out_dir, frame_id, chosen, cars, "ply")
     return fit

@@ -22,7 +22,8 @@ from directshape_torch.batch.fit_shape import ShapeFit, fit_shape
 from directshape_torch.batch.scan_fits import fit_scan
 from directshape_torch.cli.options import add_layout_options
 from directshape_torch.errors import InputError
-from directshape_torch.files.atomic_files import write_bytes, write_npz, write_text
+from directshape_torch.files.array_files import write_npz
+from directshape_torch.files.atomic_files import write_bytes, write_text
 from directshape_torch.files.read_files import finite_numbers, read_lines
 from directshape_torch.geometry.box_formats import BoxFormat
 from directshape_torch.io.stereo_dataset import open_dataset

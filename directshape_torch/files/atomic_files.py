@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
-import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-# The earliest date a zip entry can carry; a constant one makes equal content give equal bytes.
-_ZIP_DATE = (1980, 1, 1, 0, 0, 0)
 
 
 def write_bytes(path: Path | str, content: bytes, durable: bool = False) -> None:
@@ -69,20 +64,6 @@ def write_json(path: Path | str, value: Any, durable: bool = False) -> None:
     """Write `value` as JSON with sorted keys and a final newline; NaN and infinity are refused, JSON has none."""
     text = json.dumps(value, indent=2, sort_keys=True, allow_nan=False) + "\n"
     write_bytes(path, text.encode("utf-8"), durable)
-
-
-def write_npz(path: Path | str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write a compressed npz whose bytes depend on the arrays alone (`numpy.savez` stores the time of day)."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for name, array in arrays.items():
-            entry = zipfile.ZipInfo(f"{name}.npy", date_time=_ZIP_DATE)
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            entry.create_system = 3  # the same bytes on every operating system
-            content = io.BytesIO()
-            np.lib.format.write_array(content, np.asarray(array), allow_pickle=False)
-            archive.writestr(entry, content.getvalue())
-    write_bytes(path, buffer.getvalue())
 
 
 def write_png(path: Path | str, image: NDArray[Any]) -> None:

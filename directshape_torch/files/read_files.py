@@ -6,12 +6,10 @@ is ever unpickled.
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import os
 import stat
-import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, wraps
@@ -23,14 +21,14 @@ from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, shown
 
-_MOST_BYTES = 2**29
+MOST_BYTES = 2**29
+"""Of one file, and of what it unpacks to."""
+
 # A line of one letter takes two hundred bytes once it is numbered.
 _MOST_TEXT_BYTES = 2**24
 # Parsed JSON takes some twenty times its size.
 _MOST_JSON_BYTES = 2**28
 _MOST_DIGITS = 18
-_ENCRYPTED = 1
-_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 # What is left of the 255 that file systems take belongs to endings and to the names of temporary files.
 _MOST_NAME_BYTES = 200
 _T = TypeVar("_T")
@@ -53,7 +51,7 @@ def is_frame_id(frame_id: object) -> bool:
     )
 
 
-def read_bytes(path: Path | str, most: int = _MOST_BYTES, cure: str = "check the path") -> bytes:
+def read_bytes(path: Path | str, most: int = MOST_BYTES, cure: str = "check the path") -> bytes:
     """The content of a regular file of at most that many bytes; links are followed.
 
     Raises:
@@ -202,65 +200,3 @@ def _decimal(text: str) -> float:
     if not abs(number) < float("inf"):
         raise ValueError(f"the number {text} is out of range")
     return number
-
-
-def read_npz(path: Path | str, cure: str = "") -> dict[str, NDArray[Any]]:
-    """All arrays of an npz file by name.
-
-    Raises:
-        DataFormatError: the file is missing, damaged, no npz, larger than 512 MiB unpacked, or holds Python objects.
-
-    Examples:
-        >>> import tempfile
-        >>> from directshape_torch.files.atomic_files import write_npz
-        >>> file = Path(tempfile.mkdtemp()) / "a.npz"
-        >>> write_npz(file, {"codes": np.zeros((2, 5))})
-        >>> read_npz(file)["codes"].shape
-        (2, 5)
-    """
-    # From memory: numpy leaves the file open when it turns out to be no archive.
-    content = io.BytesIO(read_bytes(path, cure=cure))
-    try:
-        _check_entries(content)
-        with np.load(content, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        # Of an entry without the ending ".npy" numpy gives the bytes.
-        if others := [name for name, array in arrays.items() if not isinstance(array, np.ndarray)]:
-            raise ValueError(f"{others[0]} is no array")
-        return arrays
-    # Of an archive damaged on purpose numpy and zipfile raise whatever they come across.
-    except Exception as error:
-        raise DataFormatError(path, f"is no readable npz file ({error})", cure=cure) from error
-
-
-def _check_entries(content: io.BytesIO) -> None:
-    """Raise `ValueError` where an archive is larger than its budget, or packed as `numpy` never does."""
-    with zipfile.ZipFile(content) as archive:
-        entries = archive.infolist()
-    total = sum(entry.file_size for entry in entries)
-    if total > _MOST_BYTES:
-        raise ValueError(f"unpacked it has {total} bytes, at most {_MOST_BYTES} are read")
-    for entry in entries:
-        if entry.flag_bits & _ENCRYPTED or entry.compress_type not in _COMPRESSIONS:
-            raise ValueError(f"{entry.filename} is encrypted or not compressed by deflation")
-
-
-def read_npy(path: Path | str) -> NDArray[Any]:
-    """The array of an npy file, read-only.
-
-    Raises:
-        DataFormatError: the file is missing, damaged, no npy, larger than 512 MiB, or holds Python objects.
-    """
-    cure = "save it with numpy.save"
-    content = read_bytes(path, cure=cure)
-    stream = io.BytesIO(content)
-    try:
-        version = np.lib.format.read_magic(stream)
-        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, is_fortran, dtype = header(stream)
-        # What the header promises is asked of the bytes that are there: nothing is allocated for it.
-        array = np.frombuffer(content, dtype, math.prod(shape), stream.tell())
-        return array.reshape(shape, order="F" if is_fortran else "C")
-    # As above.
-    except Exception as error:
-        raise DataFormatError(path, f"is no readable npy file ({error})", cure=cure) from error

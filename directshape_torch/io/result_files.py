@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError, shown
 from directshape_torch.files import atomic_files
-from directshape_torch.files.read_files import read_npz
+from directshape_torch.files.array_files import read_npz, write_npz
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.status import Status
 
@@ -148,7 +148,7 @@ def write_arrays(path: Path | str, content: Any, version: int) -> None:
     for entry in fields(content):
         value = getattr(content, entry.name)
         arrays[entry.name] = np.array(value, dtype=np.str_) if isinstance(value, (str, tuple)) else np.asarray(value)
-    atomic_files.write_npz(path, {**arrays, "sha256": np.array(_hash_arrays(arrays))})
+    write_npz(path, {**arrays, "sha256": np.array(_hash_arrays(arrays))})
 
 
 def read_shapes(path: Path | str) -> ShapeArrays:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.files.read_files import read_bytes, read_npy
+from directshape_torch.files.array_files import read_npy
+from directshape_torch.files.read_files import read_bytes
 from directshape_torch.geometry.projection import project
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera

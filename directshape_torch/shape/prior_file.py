@@ -17,7 +17,6 @@ from directshape_torch.files.read_files import parse_json, read_bytes
 
 # One key with JSON text, because the order of several keys in the file is not fixed.
 _KEY = "description"
-_MOST_BYTES = 2**29
 _NOT_WHOLE = "not a whole safetensors file"
 _PriorT = TypeVar("_PriorT")
 
@@ -68,14 +67,14 @@ def read_description(path: Path, cure: str = "") -> dict[str, Any]:
     Raises:
         DataFormatError: no such file, or no safetensors file, or a truncated one.
     """
-    return _description(path, _read(path, cure), cure)
+    return _description(path, read_bytes(path, cure=cure), cure)
 
 
 def _read_tensors(path: Path, schema: str, cure: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
     from safetensors import SafetensorError
     from safetensors.torch import load
 
-    content = _read(path, cure)
+    content = read_bytes(path, cure=cure)
     description = _description(path, content, cure)
     found = description.get("schema", "none")
     if found != schema:
@@ -88,10 +87,6 @@ def _read_tensors(path: Path, schema: str, cure: str) -> tuple[dict[str, Tensor]
         if not is_floating or not bool(torch.isfinite(tensor).all()):
             raise DataFormatError(path, f"{name} holds values that are no finite floating-point numbers")
     return {name: tensor for name, (_, tensor) in tensors.items()}, description
-
-
-def _read(path: Path, cure: str) -> bytes:
-    return read_bytes(path, _MOST_BYTES, cure)
 
 
 def _description(path: Path, content: bytes, cure: str) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from directshape_torch.errors import DataFormatError
 from directshape_torch.evaluation.matching import is_counted, match_to_labels
 from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
-from directshape_torch.files.read_files import read_npz
+from directshape_torch.files.array_files import read_npz
 from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refinement.quality import EVIDENCE_NAMES

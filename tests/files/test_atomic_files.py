@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from directshape_torch.files import atomic_files
+from directshape_torch.files.array_files import write_npz
 from directshape_torch.io.image_files import read_rgb, read_single_channel
 
 
@@ -60,9 +61,9 @@ def test_results_are_as_readable_as_other_new_files(tmp_path: Path) -> None:
 
 def test_npz_bytes_do_not_depend_on_the_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     arrays = {"a": np.arange(5.0), "names": np.array(["x", "yy"])}
-    atomic_files.write_npz(tmp_path / "1.npz", arrays)
+    write_npz(tmp_path / "1.npz", arrays)
     monkeypatch.setattr(time, "time", lambda: 2e9)
-    atomic_files.write_npz(tmp_path / "2.npz", arrays)
+    write_npz(tmp_path / "2.npz", arrays)
     assert (tmp_path / "1.npz").read_bytes() == (tmp_path / "2.npz").read_bytes()
     with np.load(tmp_path / "1.npz", allow_pickle=False) as archive:
         assert archive["names"].tolist() == ["x", "yy"]
@@ -71,7 +72,7 @@ def test_npz_bytes_do_not_depend_on_the_time(tmp_path: Path, monkeypatch: pytest
 
 def test_npz_refuses_python_objects(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"[Oo]bject arrays"):
-        atomic_files.write_npz(tmp_path / "1.npz", {"a": np.array([{}], dtype=object)})
+        write_npz(tmp_path / "1.npz", {"a": np.array([{}], dtype=object)})
     assert not list(tmp_path.iterdir())
 
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.files.atomic_files import write_npz
-from directshape_torch.files.read_files import read_npz
+from directshape_torch.files.array_files import read_npz, write_npz
 
 
 def test_other_content(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from helpers.shape_arrays import shape_arrays
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.files.atomic_files import write_npz
+from directshape_torch.files.array_files import write_npz
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.result_files import (
     ShapeArrays,
