@@ -56,9 +56,9 @@ _COST_INKS: dict[str, Colour] = {
 }
 _KINDS = {"silhouette_left": "silhouette left", "silhouette_right": "silhouette right", "photometric": "photometric"}
 _MEANING = (
-    "silhouette: orange spills out of the mask, violet does not fill it, mean of -log p"
-    "; photometric: the right image is darker (blue), equal (white), brighter (red), "
-    f"full colour from {WORST_GREY_LEVELS:.0f} grey levels, mean in grey levels"
+    "silhouette: orange spills out of the mask, violet does not fill it; mean of -log p",
+    "photometric: right image darker (blue), equal (white), brighter (red), lost (grey); mean in grey levels, "
+    f"full colour from {WORST_GREY_LEVELS:.0f}",
 )
 
 
@@ -191,7 +191,7 @@ def residual_figure(car: CarCourse) -> Picture:
                 draw_contour(view, surface, ink, 1)
             panels.append(titled(view.picture, f"{name}: {words}, {_mean(residuals, kind)}"))
         rows.append(beside(panels))
-    return titled(beside(rows, below=True), car.title, _MEANING)
+    return titled(beside(rows, below=True), car.title, *_MEANING)
 
 
 def _mean(residuals: CarResiduals, kind: str) -> str:

@@ -150,12 +150,12 @@ def draw_residuals(view: View, residuals: CarResiduals, name: str, share: float 
 
     A square is as large as a share of the distance of the pixels.
     """
-    view.picture[...] = view.picture.mean(axis=2, keepdims=True) * 0.5
+    view.picture[...] = view.picture.mean(axis=2, keepdims=True) * 0.5 + 24
     values, uv = getattr(residuals, name), residuals.silhouette_left.uv
     if name != "photometric":
         values = PixelResiduals(*(x[np.abs(values.value) > _NOTHING_SILHOUETTE] for x in values))
     colours = (photometric_colours if name == "photometric" else silhouette_colours)(values)
-    apart_px = float(np.sqrt(np.prod(np.ptp(uv, axis=0) + 1) / len(uv))) if len(uv) else 1.0
+    apart_px = float(np.ceil(np.sqrt(np.prod(np.ptp(uv, axis=0) + 1) / len(uv)))) if len(uv) else 1.0
     half = 0.5 * max(share * apart_px * view.from_image[0, 0], 2.0)
     for place, colour in zip(view.places(values.uv), colours.tolist(), strict=True):
         first, last = np.floor(place - half + 0.5), np.ceil(place + half - 0.5)

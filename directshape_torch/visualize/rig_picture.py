@@ -52,10 +52,10 @@ def draw_disparity_field(
     for place, colour in zip(uv_left.round().long().cpu().tolist(), colours, strict=True):
         cv2.circle(panel, place, _DOT_RADIUS_PX, BLACK, -1, cv2.LINE_AA)
         cv2.circle(panel, place, _DOT_RADIUS_PX - 2, colour, -1, cv2.LINE_AA)
-    lines = ["measured less true disparity: the field in bands of 0.25 px, and a dot for each car, in the grey outline"]
+    lines = ["measured less true disparity, in bands of 0.25 px; the grey outline is round the data"]
     if len(bias_px):
         before, after = _summary(bias_px), _summary(bias_px - field.bias(uv_left))
-        lines.append(f"{len(bias_px)} cars: {before} before the field is taken off, {after} after")
+        lines.append(f"a dot for each of {len(bias_px)} cars: {before} before the field is taken off, {after} after")
     return titled(np.concatenate([_scale(limit, width), panel]), *lines)
 
 

@@ -8,7 +8,8 @@ import { counted } from "report/format";
 import { readMesh } from "report/mesh";
 import { EDGES } from "report/frame_picture";
 
-const PAINTS = [0x4287f5, 0xeb7832, 0x50be6e, 0xcd50a0, 0xe6c33c, 0x9a8cf0];
+// Pale, so that none is taken for the lines before, after and of the truth.
+const PAINTS = [0x9db4cf, 0xcfb79a, 0xa5bf9f, 0xc3a4bd, 0xcac39a, 0xabb3bb];
 const COLOURS = { before: 0xff9f1a, after: 0x3aa0ff, truth: 0x35c258 };
 
 export class Viewer {
