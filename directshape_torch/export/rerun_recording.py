@@ -15,15 +15,13 @@ from directshape_torch.errors import MissingDependencyError
 from directshape_torch.export.box_files import image_numbers
 from directshape_torch.export.frame_source import Exporter, FrameSource
 from directshape_torch.export.painted_cars import ground_grid
-from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import MASK_THRESHOLD
-from directshape_torch.shape.zero_level import sdf_to_mesh
 from directshape_torch.stereo_matching.disparity import rgb8
 from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Colour
-from directshape_torch.visualize.drawn_car import corners_cam
+from directshape_torch.visualize.drawn_car import cars_of_result
 from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
 from directshape_torch.visualize.residuals import CarResiduals, photometric_colours, silhouette_colours
 
@@ -84,15 +82,16 @@ class RerunExporter(Exporter):
     def _add_iterations(self, stream: _Stream, loaded: LoadedFrame, refiner: DirectShapeRefiner, frame: int) -> None:
         device, dtype = refiner.prior.origin.device, refiner.prior.origin.dtype
         trace = trace_refinement(refiner, loaded.frame.to(device, dtype), loaded.detections.to(device, dtype))
-        log = _IterationLog(stream, loaded, trace)
+        lines = [one.line_number for one in loaded.detected_objects]
         stream.at(iteration=self.iteration)
         _clear_cars(stream)
         for number in range(len(trace)):
             stream.at(iteration=self.iteration + number)
-            log.log_state(number)
+            _log_state(stream, trace, number, lines)
+            _log_costs(stream, trace, number, lines, loaded.frame_id)
         stream.at(frame)
-        for car, residuals in trace.residuals(len(trace) - 1).items():
-            log.log_residuals(car, residuals)
+        for row, residuals in trace.residuals(len(trace) - 1).items():
+            _log_residuals(stream, lines[row], residuals)
         self.iteration += len(trace)
 
     def finish(self) -> None:
@@ -157,52 +156,34 @@ def _log_boxes(stream: _Stream, source: FrameSource) -> None:
     stream.log_boxes("world/boxes/after", box_corners(torch.from_numpy(T_cam_box), hwl).numpy(), colours, labels)
 
 
-class _IterationLog:
-    """Logs the states of the cars of one frame."""
+def _log_state(stream: _Stream, trace: RefinementTrace, number: int, lines: Sequence[int]) -> None:
+    """Surfaces, boxes and residuals of all cars in a state; what a car shares with the one before stays."""
+    rows = trace.rows.tolist()
+    cars = cars_of_result(trace.moment(number)[trace.rows], [lines[row] for row in rows])
+    corners = np.array([car.corners_cam for car in cars])
+    stream.log_boxes("world/boxes/iteration", corners, [_STATE_RGB] * len(cars), [f"{car.line}" for car in cars])
+    moved = {row: car for row, car in zip(rows, cars, strict=True) if number in trace.steps_of(row)}
+    residuals = trace.residuals(number) if moved else {}
+    for row, car in moved.items():
+        assert car.surface is not None, "a trace has its prior"
+        stream.log_mesh(f"world/cars/{car.line}", car.surface, _STATE_RGB)
+        _log_residuals(stream, car.line, residuals[row])
 
-    def __init__(self, stream: _Stream, loaded: LoadedFrame, trace: RefinementTrace) -> None:
-        self.stream, self.loaded, self.trace = stream, loaded, trace
-        self.cars = [int(row) for row in trace.rows.tolist()]
 
-    def line(self, car: int) -> int:
-        """The number of a car's line in the detection file."""
-        return self.loaded.detected_objects[car].line_number
+def _log_residuals(stream: _Stream, line: int, residuals: CarResiduals) -> None:
+    """Sampled pixels coloured by what they cost: silhouettes in both images, photometry in the left one."""
+    for name, values in zip(_RESIDUALS, residuals, strict=True):
+        colours = photometric_colours if values is residuals.photometric else silhouette_colours
+        # Rerun's pixels have their corners at whole numbers, ours their centres.
+        stream.log(f"{name}/{line}", stream.rr.Points2D(values.uv + 0.5, colors=colours(values), radii=_DOT_PX))
 
-    def log_state(self, number: int) -> None:
-        """Surfaces, boxes, residuals and costs of all cars in a state; what a car shares with the one before stays."""
-        self._log_boxes(number)
-        moved = [car for car in self.cars if number in self.trace.steps_of(car)]
-        residuals = self.trace.residuals(number) if moved else {}
-        state, prior = self.trace.states[number], self.trace.result.prior
-        for car in self.cars:
-            if car in moved:
-                values = prior.values(state.code[car : car + 1])[0]
-                surface = sdf_to_mesh(values, prior.origin, prior.spacing_m, se3.inverse(state.T_obj_cam[car]))
-                self.stream.log_mesh(f"world/cars/{self.line(car)}", surface, _STATE_RGB)
-                self.log_residuals(car, residuals[car])
-            self._log_costs(car, number)
 
-    def log_residuals(self, car: int, residuals: CarResiduals) -> None:
-        """Sampled pixels coloured by what they cost: silhouettes in both images, photometry in the left one."""
-        for name, values in zip(_RESIDUALS, residuals, strict=True):
-            colours = photometric_colours if values is residuals.photometric else silhouette_colours
-            # Rerun's pixels have their corners at whole numbers, ours their centres.
-            dots = self.stream.rr.Points2D(values.uv + 0.5, colors=colours(values), radii=_DOT_PX)
-            self.stream.log(f"{name}/{self.line(car)}", dots)
-
-    def _log_costs(self, car: int, number: int) -> None:
-        costs = self.trace.costs[number, car].double().cpu().tolist()
-        series = f"{self.loaded.frame_id}/{self.line(car)}"
-        self.stream.log(f"cost/{series}", self.stream.rr.Scalars(sum(costs)))
-        for name, cost in zip(self.trace.result.term_names, costs, strict=True):
-            self.stream.log(f"terms/{series}/{name.replace(' ', '_')}", self.stream.rr.Scalars(cost))
-
-    def _log_boxes(self, number: int) -> None:
-        """Boxes measured on the zero level of the state, as those of a result are."""
-        then, labels = self.trace.moment(number)[self.trace.rows], [f"{self.line(car)}" for car in self.cars]
-        boxes = then.boxes()
-        corners = corners_cam(boxes.location_ref, boxes.rotation_y, boxes.dimensions_hwl, then.t_cam_ref)
-        self.stream.log_boxes("world/boxes/iteration", corners, [_STATE_RGB] * len(labels), labels)
+def _log_costs(stream: _Stream, trace: RefinementTrace, number: int, lines: Sequence[int], frame_id: str) -> None:
+    for row in trace.rows.tolist():
+        costs, series = trace.costs[number, row].double().cpu().tolist(), f"{frame_id}/{lines[row]}"
+        stream.log(f"cost/{series}", stream.rr.Scalars(sum(costs)))
+        for name, cost in zip(trace.result.term_names, costs, strict=True):
+            stream.log(f"terms/{series}/{name.replace(' ', '_')}", stream.rr.Scalars(cost))
 
 
 def _import_rerun() -> Any:

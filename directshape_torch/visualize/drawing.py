@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -18,6 +18,9 @@ from directshape_torch.geometry.box3d import BOX_EDGES
 from directshape_torch.observation.occlusion import Side
 from directshape_torch.scene import FrameBatch
 from directshape_torch.stereo_matching.disparity import rgb8
+
+if TYPE_CHECKING:
+    import trimesh
 
 Picture = npt.NDArray[np.uint8]
 Array = npt.NDArray[np.floating[Any]]
@@ -119,18 +122,6 @@ class View:
         return None if u1 - u0 < 1 or v1 - v0 < 1 else (u0, v0, u1, v1)
 
 
-@dataclass(frozen=True)
-class Surface:
-    """Triangles of a shape."""
-
-    vertices: Array  # (V, 3) metres
-    faces: npt.NDArray[np.integer[Any]]  # (F, 3)
-
-    def moved(self, T: Array) -> Surface:
-        """The same surface where T (4, 4) puts it."""
-        return Surface(self.vertices @ T[:3, :3].T + T[:3, 3], self.faces)
-
-
 def blue_white_red(values: Array, limit: float) -> Array:
     """Colours (*, 3), 0 .. 255: blue from -limit on, white at 0 and for NaN, red from the limit on."""
     share = np.clip(np.nan_to_num(values) / limit, -1, 1)[..., None]
@@ -138,7 +129,7 @@ def blue_white_red(values: Array, limit: float) -> Array:
     return np.asarray(white + np.abs(share) * (np.where(share > 0, red, blue) - white))
 
 
-def draw_contour(view: View, surface: Surface, colour: Colour, thickness: int = 2) -> None:
+def draw_contour(view: View, surface: trimesh.Trimesh, colour: Colour, thickness: int = 2) -> None:
     """The outline of the projected shape (what its silhouette term sees)."""
     draw_outline(view.picture, silhouette_mask(view, surface), colour, thickness)
 
@@ -150,14 +141,15 @@ def draw_outline(picture: Picture, mask: Picture, colour: Colour, thickness: int
     cv2.drawContours(picture, contours, -1, colour, thickness, cv2.LINE_AA, offset=(-rim, -rim))
 
 
-def silhouette_mask(view: View, surface: Surface) -> Picture:
+def silhouette_mask(view: View, surface: trimesh.Trimesh) -> Picture:
     """Where a triangle of the shape is seen, 255, else 0, (h, w); triangles that reach behind the camera are not."""
     mask = np.zeros(view.picture.shape[:2], np.uint8)
-    in_front = surface.vertices[:, 2] > NEAR_PLANE_M
-    pixels = np.zeros((len(surface.vertices), 2), np.int32)
-    pixels[in_front] = _fixed_point(view.project(surface.vertices[in_front]))
+    vertices, faces = np.asarray(surface.vertices), np.asarray(surface.faces)
+    in_front = vertices[:, 2] > NEAR_PLANE_M
+    pixels = np.zeros((len(vertices), 2), np.int32)
+    pixels[in_front] = _fixed_point(view.project(vertices[in_front]))
     # One by one: a common fill would leave what two triangles cover empty.
-    for triangle in pixels[surface.faces[in_front[surface.faces].all(axis=1)]]:
+    for triangle in pixels[faces[in_front[faces].all(axis=1)]]:
         cv2.fillConvexPoly(mask, triangle, 255, cv2.LINE_8, _SHIFT)
     return mask
 

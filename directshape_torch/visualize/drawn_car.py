@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,7 +19,10 @@ from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.shape.zero_level import sdf_to_mesh
 from directshape_torch.status import Status
-from directshape_torch.visualize.drawing import BLUE, GREY, ORANGE, Array, Colour, Surface
+from directshape_torch.visualize.drawing import BLUE, GREY, ORANGE, Array, Colour
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 @dataclass(frozen=True)
@@ -28,14 +32,14 @@ class DrawnCar:
     T_cam_obj: Array  # (4, 4) of the shape
     corners_cam: Array  # (8, 3) of its box, in the order of `box_corners`, metres
     code: Array  # (K,) of the shape
-    mesh: Surface | None  # the shape in its object frame, or None where no prior is at hand
+    mesh: trimesh.Trimesh | None  # the shape in its object frame, or None where no prior is at hand
     line: int  # of the detection file
     status: str | None = None  # how its refinement ended; None before it
 
     @property
-    def surface(self) -> Surface | None:
+    def surface(self) -> trimesh.Trimesh | None:
         """The shape where it is."""
-        return None if self.mesh is None else self.mesh.moved(self.T_cam_obj)
+        return None if self.mesh is None else self.mesh.copy().apply_transform(self.T_cam_obj)
 
     @property
     def distance_m(self) -> float:
@@ -87,7 +91,7 @@ def corners_cam(location_ref: Tensor, rotation_y: Tensor, hwl: Tensor, t_cam_ref
 def cars_before(
     objects: Sequence[KittiObject],
     t_cam_ref: Tensor,  # (3,)
-    mean: Surface | None,
+    mean: trimesh.Trimesh | None,
     num_codes: int,
 ) -> list[DrawnCar]:
     """The mean shape at the place of each detection, with the detection's box."""
@@ -127,24 +131,25 @@ def cars_after(
     return cars
 
 
-def mean_car(prior: ShapePrior) -> Surface:
+def mean_car(prior: ShapePrior) -> trimesh.Trimesh:
     """The mean shape in its object frame."""
     return decoded_car(prior, prior.initial_code(1)[0].cpu().numpy())
 
 
-def decoded_car(prior: ShapePrior, code: Array) -> Surface:
+def decoded_car(prior: ShapePrior, code: Array) -> trimesh.Trimesh:
     """The shape of a code (K,) in its object frame."""
     codes = torch.from_numpy(np.asarray(code, dtype=np.float64))[None].to(prior.origin)
-    mesh = sdf_to_mesh(prior.values(codes)[0], prior.origin, prior.spacing_m)
-    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    return sdf_to_mesh(prior.values(codes)[0], prior.origin, prior.spacing_m)
 
 
-def _saved_car(path: Path, T_cam_obj: Array) -> Surface:
+def _saved_car(path: Path, T_cam_obj: Array) -> trimesh.Trimesh:
     """The shape of a mesh file of a run, taken back from the camera to the object frame."""
+    import trimesh
+
     vertices_cam, faces = read_mesh(path, cure="refine the frame again")
     if path.suffix == ".glb":
         vertices_cam = vertices_cam @ T_GLTF_CAM[:3, :3]
-    return Surface((vertices_cam - T_cam_obj[:3, 3]) @ T_cam_obj[:3, :3], faces)
+    return trimesh.Trimesh((vertices_cam - T_cam_obj[:3, 3]) @ T_cam_obj[:3, :3], faces, process=False)
 
 
 def true_corners(labels: Sequence[KittiObject] | None, classes: Sequence[str], t_cam_ref: Tensor) -> list[Array]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from directshape_torch.io.run_folder import FrameResult, RunFolder, shapes_path
 from directshape_torch.io.run_manifest import hash_file, hash_prior
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.visualize.drawing import Array, Surface
+from directshape_torch.visualize.drawing import Array
 from directshape_torch.visualize.drawn_car import (
     DrawnCar,
     cars_after,
@@ -26,6 +27,9 @@ from directshape_torch.visualize.drawn_car import (
     mean_car,
     true_corners,
 )
+
+if TYPE_CHECKING:
+    import trimesh
 
 _WORDS = {"image_left": "left image", "image_right": "right image", "ground_plane": "ground plane"}
 
@@ -51,7 +55,7 @@ class RunInputs:
             raise InputError("prior", "that of the run", "another one", "name that of the run with --prior")
 
     @cached_property
-    def mean(self) -> Surface | None:
+    def mean(self) -> trimesh.Trimesh | None:
         """The mean shape in its object frame."""
         return None if self.prior is None else mean_car(self.prior)
 

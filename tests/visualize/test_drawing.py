@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.visualize.drawing import (
-    Surface,
+    Array,
     View,
     curves,
     draw_box,
@@ -28,25 +29,29 @@ FACES = np.array([[0, 1, 2], [0, 2, 3]])
 BLUE = (0, 0, 255)
 
 
+def mesh(vertices: Array) -> trimesh.Trimesh:
+    return trimesh.Trimesh(vertices, FACES, process=False)
+
+
 def black(width: int = 101, height: int = 81) -> View:
     return View(np.zeros((height, width, 3), np.uint8), P)
 
 
 def test_silhouette_of_a_square() -> None:
     # 1 m at 10 m with f = 100 px: 10 px around the principal point (50, 40).
-    mask = silhouette_mask(black(), Surface(SQUARE, FACES))
+    mask = silhouette_mask(black(), mesh(SQUARE))
     rows, columns = np.nonzero(mask)
     assert (columns.min(), columns.max(), rows.min(), rows.max()) == (40, 60, 30, 50)
     assert mask[30:51, 40:61].all()
 
 
 def test_triangles_behind_the_camera_are_left_out() -> None:
-    behind = Surface(SQUARE - np.array([0, 0, 20]), FACES)
+    behind = mesh(SQUARE - np.array([0, 0, 20]))
     assert not silhouette_mask(black(), behind).any()
     half = SQUARE.copy()
     half[3, 2] = -5
     # Only the triangle 0, 1, 2 is in front.
-    mask = silhouette_mask(black(), Surface(half, FACES))
+    mask = silhouette_mask(black(), mesh(half))
     assert mask[32, 58] == 255
     assert mask[48, 42] == 0
 
@@ -54,7 +59,7 @@ def test_triangles_behind_the_camera_are_left_out() -> None:
 def test_contour_has_no_line_along_the_border_of_the_picture() -> None:
     view = black()
     # The left half of the square lies outside the picture.
-    draw_contour(view, Surface(SQUARE - np.array([5, 0, 0]), FACES), BLUE, 1)
+    draw_contour(view, mesh(SQUARE - np.array([5, 0, 0])), BLUE, 1)
     drawn = view.picture.any(axis=2)
     assert drawn[30, :11].any()
     assert drawn[30:51, 10].all()

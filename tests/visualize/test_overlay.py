@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
-from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Array, Picture, Surface, View
+from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Array, Picture, View
 from directshape_torch.visualize.drawn_car import DrawnCar
 from directshape_torch.visualize.overlay import draw_footprint, ground_view, overlay_picture
 
@@ -24,7 +25,7 @@ def corners(x: float, z: float) -> Array:
 
 def car(x: float, z: float, line: int = 1, status: str | None = "converged") -> DrawnCar:
     points = corners(x, z)
-    return DrawnCar(np.eye(4), points, np.zeros(0), Surface(points, FACES), line, status)
+    return DrawnCar(np.eye(4), points, np.zeros(0), trimesh.Trimesh(points, FACES, process=False), line, status)
 
 
 def has_colour(picture: Picture, colour: tuple[int, int, int]) -> bool:
