@@ -47,6 +47,12 @@ def two_frames() -> tuple[FrameBatch, Detections, list[tuple[FrameBatch, Detecti
     return frames, joined_detections([p[1] for p in parts], tuple(frames.images_left.shape[2:])), parts
 
 
+@lru_cache(maxsize=1)
+def refined_frames() -> RefinementResult:
+    """That batch by the default settings; nobody changes it."""
+    return refiner()(*two_frames()[:2])
+
+
 def assert_same(a: RefinementResult, b: RefinementResult, tolerance: float = 1e-9) -> None:
     assert a.status == b.status
     assert torch.equal(a.iterations, b.iterations)
@@ -59,7 +65,7 @@ def assert_same(a: RefinementResult, b: RefinementResult, tolerance: float = 1e-
 def test_a_batch_of_frames_equals_a_loop_over_them(config: RefinerConfig) -> None:
     """Frames of different sizes: padding with arbitrary values must change nothing either."""
     frames, detections, parts = two_frames()
-    batch = refiner(config)(frames, detections)
+    batch = refined_frames() if config is DEFAULT else refiner(config)(frames, detections)
     first, second = (refiner(config)(*part) for part in parts)
     assert_same(batch[[0, 1]], first)
     assert_same(batch[[2]], second)
@@ -76,12 +82,12 @@ def test_a_batch_of_cars_equals_a_loop_over_them() -> None:
         assert_same(batch[[i]], alone)
 
 
-@pytest.mark.parametrize("order", [[1, 0, 2], [2, 1, 0], [1, 2, 0]])
-def test_permuting_cars_permutes_results(order: list[int]) -> None:
+def test_permuting_cars_permutes_results() -> None:
+    """Of both frames, in an order that is not its own inverse."""
     frames, detections, _ = two_frames()
-    expected = refiner()(frames, detections)
+    order = [1, 2, 0]
     permuted = refiner()(frames, select(detections, torch.tensor(order)))
-    assert_same(permuted, expected[order])
+    assert_same(permuted, refined_frames()[order])
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -122,7 +128,7 @@ def test_prior_lives_in_the_state_dict() -> None:
     frames, detections, _ = two_frames()
     target.load_state_dict(source.state_dict())
     assert {"prior.mean", "prior.basis", "prior.origin"} <= set(source.state_dict())
-    assert torch.equal(source(frames, detections).T_cam_obj, target(frames, detections).T_cam_obj)
+    assert torch.equal(target(frames, detections).T_cam_obj, refined_frames().T_cam_obj)
     assert not list(source.parameters())
 
 
@@ -146,8 +152,7 @@ def test_a_rotated_right_camera_is_taken_into_account() -> None:
 
 
 def test_statuses_costs_and_names_fit_together() -> None:
-    frames, detections, _ = two_frames()
-    result = refiner()(frames, detections)
+    result = refined_frames()
     assert len(result) == 3
     assert result.cost_before.shape == result.cost_after.shape == (3, len(result.term_names))
     assert result.term_names[:3] == ("silhouette_left", "silhouette_right", "photometric")

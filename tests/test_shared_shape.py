@@ -68,6 +68,12 @@ def by_themselves() -> RefinementResult:
     return refined(drive()[1])
 
 
+@cache
+def of_tracks(*track_id: int) -> RefinementResult:
+    """The six detections with these tracks; nobody changes it."""
+    return refined(drive()[1], list(track_id))
+
+
 def assert_same(one: RefinementResult, other: RefinementResult) -> None:
     first, second = one.state_dict(), other.state_dict()
     for name, values in first.items():
@@ -75,13 +81,11 @@ def assert_same(one: RefinementResult, other: RefinementResult) -> None:
 
 
 def test_tracks_of_one_view_are_cars_by_themselves_to_the_bit() -> None:
-    _, detections, _ = drive()
-    assert_same(refined(detections, [4, -1, 9, -1, 2, -7]), by_themselves())
+    assert_same(of_tracks(4, -1, 9, -1, 2, -7), by_themselves())
 
 
 def test_cars_beside_a_track_are_refined_as_by_themselves_to_the_bit() -> None:
-    _, detections, _ = drive()
-    alone, mixed = by_themselves(), refined(detections, [4, -1, 4, -1, 4, 3])
+    alone, mixed = by_themselves(), of_tracks(4, -1, 4, -1, 4, 3)
     for row in (1, 3, 5):
         assert torch.equal(mixed.T_cam_obj[row], alone.T_cam_obj[row])
         assert torch.equal(mixed.code[row], alone.code[row])
@@ -89,7 +93,7 @@ def test_cars_beside_a_track_are_refined_as_by_themselves_to_the_bit() -> None:
 
 def test_views_of_a_track_get_one_shape_that_is_nearer_to_the_truth() -> None:
     _, detections, code = drive()
-    alone, together = by_themselves(), refined(detections, [0, 1] * 3)
+    alone, together = by_themselves(), of_tracks(*[0, 1] * 3)
     assert together.status == [Status.converged] * 6
     for track in (0, 1):
         views = together.code[track::2]
@@ -122,10 +126,9 @@ def test_the_evidence_of_a_view_is_that_of_its_own_unknowns(time_s: tuple[float,
 
 
 def test_a_batch_of_tracks_equals_a_loop() -> None:
-    _, detections, _ = drive()
-    together = refined(detections, [7, 1, 7, 1, 7, -1])
+    together = of_tracks(7, 1, 7, 1, 7, -1)
     for track_id, rows in (([3, -1, 3, -1, 3, -1], [0, 2, 4]), ([-1, 3, -1, 3, -1, -1], [1, 3])):
-        one = refined(detections, track_id)
+        one = of_tracks(*track_id)
         torch.testing.assert_close(together.T_cam_obj[rows], one.T_cam_obj[rows], rtol=0, atol=1e-9)
         torch.testing.assert_close(together.code[rows], one.code[rows], rtol=0, atol=1e-9)
 
@@ -135,7 +138,7 @@ def test_the_order_of_the_detections_does_not_matter() -> None:
     order, track_id = torch.tensor([4, 1, 0, 5, 3, 2]), [7, 1, 7, 1, 7, -1]
     shuffled = select(replace(detections, track_id=torch.tensor(track_id)), order)
     assert shuffled.track_id is not None
-    moved, result = refined(shuffled, shuffled.track_id.tolist()), refined(detections, track_id)
+    moved, result = refined(shuffled, shuffled.track_id.tolist()), of_tracks(*track_id)
     torch.testing.assert_close(moved.T_cam_obj, result.T_cam_obj[order], rtol=0, atol=1e-9)
     torch.testing.assert_close(moved.code, result.code[order], rtol=0, atol=1e-9)
 
@@ -194,7 +197,7 @@ def doubt_in_track(monkeypatch: pytest.MonkeyPatch, row: int) -> None:
 
 def test_a_view_that_is_not_trusted_in_its_track_keeps_what_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
     _, detections, _ = drive()
-    alone, trusted = by_themselves(), refined(detections, [0, 1] * 3)
+    alone, trusted = by_themselves(), of_tracks(*[0, 1] * 3)
     doubt_in_track(monkeypatch, 2)
     result = refined(detections, [0, 1] * 3)
     others = [0, 1, 3, 4, 5]
@@ -209,7 +212,7 @@ def test_a_view_that_is_not_trusted_in_its_track_keeps_what_it_was(monkeypatch: 
 
 def test_a_view_that_leaves_midway_leaves_the_track_as_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
     _, detections, _ = drive()
-    without = refined(detections, [0, 1, -1, 1, 0, 1])
+    without = of_tracks(0, 1, -1, 1, 0, 1)
     minimise = tracks.minimise
 
     def failing(problem: CarProblem, *others: Any) -> Minimum[CarState]:
