@@ -8,15 +8,14 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.data_check.frame_parts import FrameParts, gather_evidence, numbers_of, read_parts
+from directshape_torch.data_check.check_frame import check_frame
 from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.rig.estimate import RigEstimate, rig_among
 from directshape_torch.rig.rig import Rig
 from directshape_torch.scene_check.car_evidence import FrameEvidence
-from directshape_torch.scene_check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, check_images
 from directshape_torch.scene_check.check_scene import check_cars
-from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, found, names
+from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, found
 
 DEFAULT_MAX_FRAMES = 20
 REPORT_SCHEMA_VERSION = 1
@@ -49,11 +48,10 @@ def check_dataset(
     evidence: list[FrameEvidence] = []
     num_cars = 0
     for frame_id in chosen:
-        parts, of_files = read_parts(dataset, frame_id)
-        of_frame, of_its_cars = _check_frame(parts, of_files)
+        of_frame, count, of_its_cars = check_frame(dataset, frame_id)
         findings += of_frame
-        evidence += of_its_cars
-        num_cars += len(parts.objects)
+        evidence += [] if of_its_cars is None else [of_its_cars]
+        num_cars += count
         tell(frame_id)
     nothing = found("no_cars", "all frames", "no detection of the chosen classes with a 3D box")
     of_cars = check_cars(evidence) if num_cars else [nothing]
@@ -69,21 +67,6 @@ def spread(frame_ids: Sequence[str], count: int | None) -> tuple[str, ...]:
     if count is None or count >= len(frame_ids):
         return tuple(frame_ids)
     return tuple(frame_ids[index * len(frame_ids) // count] for index in range(count))
-
-
-def _check_frame(parts: FrameParts, findings: list[Finding]) -> tuple[list[Finding], list[FrameEvidence]]:
-    """All findings about a frame, and what it shows of its cars, nothing where its calibration is wrong."""
-    where = f"frame {parts.frame_id}"
-    if parts.calibration is not None:
-        findings += check_calibration(*numbers_of(parts.calibration), parts.size_hw, where)
-    # A wrong calibration must not spoil what the images say by themselves.
-    usable = not names(findings) & SPOILS_CAMERA
-    if parts.pair is not None:
-        findings += check_images(*parts.pair, parts.camera if usable else None, where)
-    evidence = gather_evidence(parts) if usable else None
-    if evidence is None:
-        return findings, []
-    return findings, [replace(evidence, pair=None if names(findings) & SPOILS_PAIR else parts.pair)]
 
 
 def check_files(dataset: StereoDataset) -> list[Finding]:

@@ -18,7 +18,7 @@ import directshape_torch
 from directshape_torch.cli.main import main
 from directshape_torch.data_check import check_dataset as module
 from directshape_torch.data_check.check_dataset import check_dataset
-from directshape_torch.data_check.frame_parts import numbers_of
+from directshape_torch.data_check.check_frame import numbers_of
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera

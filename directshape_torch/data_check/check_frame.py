@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -17,32 +18,17 @@ from directshape_torch.io.instance_masks import SIDES, InstanceMask, MaskSizeErr
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.stereo_dataset import StereoDataset
-from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence, Pair
-from directshape_torch.scene_check.finding import Finding, unreadable
+from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence
+from directshape_torch.scene_check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, check_images
+from directshape_torch.scene_check.finding import Finding, names, unreadable
 
 _Part = TypeVar("_Part")
 
 
-@dataclass(frozen=True)
-class FrameParts:
-    """What could be read of a frame; None where it could not."""
-
-    frame_id: str
-    pair: Pair | None  # left and right image (H, W, 3), RGB, of one size
-    calibration: KittiCalibration | None  # the two projections
-    camera: StereoCamera | None  # the same, where it is that of a stereo pair
-    objects: list[KittiObject]  # detections of the refined classes with a 3D box
-    masks: list[InstanceMask] | None  # instances of both images
-
-    @property
-    def size_hw(self) -> tuple[int, int] | None:
-        """Of both images."""
-        return None if self.pair is None else (self.pair[0].shape[0], self.pair[0].shape[1])
-
-
-def read_parts(dataset: StereoDataset, frame_id: str) -> tuple[FrameParts, list[Finding]]:
-    """Read a frame part by part; what fails is a finding."""
-    findings: list[Finding] = []
+def check_frame(dataset: StereoDataset, frame_id: str) -> tuple[list[Finding], int, FrameEvidence | None]:
+    """All findings about a frame, the number of its cars, and what it shows of them, None where its images or its
+    calibration are wrong."""
+    findings, where = list[Finding](), f"frame {frame_id}"
 
     def attempt(check: str, expected: str, read: Callable[[], _Part]) -> _Part | None:
         try:
@@ -50,14 +36,14 @@ def read_parts(dataset: StereoDataset, frame_id: str) -> tuple[FrameParts, list[
         except (DirectShapeError, OSError) as error:
             if isinstance(error, MaskSizeError):
                 check, expected = "mask_size", "masks of the size of their image"
-            found = unreadable(check, f"frame {frame_id}", expected, error, "check the path and the file")
+            found = unreadable(check, where, expected, error, "check the path and the file")
             is_missing = isinstance(error, DataFormatError) and not error.path.exists()
             # That a file is missing is found for all frames at once, and one file may hold several parts.
             if not is_missing and found.measured not in {finding.measured for finding in findings}:
                 findings.append(found)
             return None
 
-    files, pair, masks = dataset.layout.files(frame_id), None, None
+    files, source, pair, masks, camera, size_hw = dataset.layout.files(frame_id), dataset.masks, None, None, None, None
     left = attempt("left_image", "a whole PNG or JPEG", lambda: read_rgb(files.left))
     right = attempt("right_image", "a whole PNG or JPEG", lambda: read_rgb(files.right))
     if left is not None and right is not None:
@@ -69,13 +55,26 @@ def read_parts(dataset: StereoDataset, frame_id: str) -> tuple[FrameParts, list[
         if attempt("image_size", of_calibration, lambda: calibration.of_size(size_wh)) is None:
             pair = None  # what rests on both would only say the same again
     objects = attempt("detection_file", "lines of 15 or 16 columns, or JSON as in docs/inputs.md", files.read_objects)
-    refined = [o for o in objects or [] if o.type in dataset.classes and o.has_box_3d]
-    parts = FrameParts(frame_id, pair, calibration, _camera(calibration), refined, masks)
-    source, size_hw = dataset.masks, parts.size_hw
-    if source is not None and size_hw is not None:
-        masks = attempt("mask_file", "masks of both images", lambda: source.read(frame_id, size_hw))
+    if pair is not None:
+        height, width = pair[0].shape[:2]
+        size_hw = height, width
+        if source is not None:
+            masks = attempt("mask_file", "masks of both images", lambda: source.read(frame_id, (height, width)))
     attempt("plane_file", "a x + b y + c z + d = 0 with |b| near 1", files.read_plane)
-    return replace(parts, masks=masks), findings
+    if calibration is not None:
+        findings += check_calibration(*numbers_of(calibration), size_hw, where)
+        # One that is no stereo pair's has been found by that. A singular matrix is a RuntimeError.
+        with suppress(DirectShapeError, RuntimeError):
+            camera = to_stereo_camera(calibration)
+    # A wrong calibration must not spoil what the images say by themselves.
+    camera = None if names(findings) & SPOILS_CAMERA else camera
+    if pair is not None:
+        findings += check_images(*pair, camera, where)
+    cars = [o for o in objects or [] if o.type in dataset.classes and o.has_box_3d]
+    if camera is None or size_hw is None:
+        return findings, len(cars), None
+    evidence = _evidence(frame_id, cars, masks, camera, size_hw)
+    return findings, len(cars), replace(evidence, pair=None if names(findings) & SPOILS_PAIR else pair)
 
 
 def numbers_of(calibration: KittiCalibration) -> tuple[dict[str, NDArray[np.float64]], float]:
@@ -88,28 +87,29 @@ def numbers_of(calibration: KittiCalibration) -> tuple[dict[str, NDArray[np.floa
     return {name: matrix[:, :3] for name, matrix in P.items()}, float(shift[0] - shift[1])
 
 
-def gather_evidence(parts: FrameParts) -> FrameEvidence | None:
-    """The evidence of a frame, or None where its images or its calibration cannot be used.
-
-    Masks are matched by 2D boxes alone, for the 3D ones are what is in question. Those of the right image are held
-    against the same boxes, where they should fit less well.
-    """
-    if parts.camera is None or parts.size_hw is None:
-        return None
+def _evidence(
+    frame_id: str,
+    cars: list[KittiObject],
+    masks: list[InstanceMask] | None,
+    camera: StereoCamera,
+    size_hw: tuple[int, int],
+) -> FrameEvidence:
+    """Masks are matched by 2D boxes alone, for the 3D ones are what is in question. Those of the right image are held
+    against the same boxes, where they should fit less well."""
     boxes = CarBoxes(
-        _columns([o.location_ref for o in parts.objects], 3),
-        _columns([o.hwl for o in parts.objects], 3),
-        np.array([o.rotation_y for o in parts.objects], dtype=np.float64),
-        np.array([o.alpha for o in parts.objects], dtype=np.float64),
-        _columns([o.box_2d for o in parts.objects], 4),
+        _columns([o.location_ref for o in cars], 3),
+        _columns([o.hwl for o in cars], 3),
+        np.array([o.rotation_y for o in cars], dtype=np.float64),
+        np.array([o.alpha for o in cars], dtype=np.float64),
+        _columns([o.box_2d for o in cars], 4),
     )
-    of_cars = {side: [mask for mask in parts.masks or [] if mask.is_car and mask.side == side] for side in SIDES}
+    of_cars = {side: [mask for mask in masks or [] if mask.is_car and mask.side == side] for side in SIDES}
     matches = {side: match_masks(boxes.box_2d, of_side) for side, of_side in of_cars.items()}
     own = {side: [None if k < 0 else of_cars[side][k] for k in matches[side][0].tolist()] for side in SIDES}
     nothing = (np.nan,) * 4
     seen = _columns([box for mask in of_cars["left"] for box in (mask.mask_box, mask.box)], 4)
     return FrameEvidence(
-        frame_id=parts.frame_id,
+        frame_id=frame_id,
         boxes=boxes,
         mask_boxes={
             side: _columns([nothing if mask is None else mask.mask_box for mask in own[side]], 4) for side in SIDES
@@ -118,19 +118,11 @@ def gather_evidence(parts: FrameParts) -> FrameEvidence | None:
         num_masks={side: len(of_cars[side]) for side in SIDES},
         seen=(seen,) * len(boxes),
         masks=tuple(None if mask is None else np.asarray(mask.probability > 0.5) for mask in own["left"]),
-        camera=parts.camera,
-        size_hw=parts.size_hw,
-        has_masks=parts.masks is not None,
+        camera=camera,
+        size_hw=size_hw,
+        has_masks=masks is not None,
     )
 
 
 def _columns(rows: Sequence[tuple[float, ...]], count: int) -> NDArray[np.float64]:
     return np.array(rows, dtype=np.float64).reshape(-1, count)
-
-
-def _camera(calibration: KittiCalibration | None) -> StereoCamera | None:
-    """None also for a calibration that is no stereo pair's; `check_calibration` says why."""
-    try:
-        return None if calibration is None else to_stereo_camera(calibration)
-    except (DirectShapeError, RuntimeError):  # a singular matrix is a RuntimeError
-        return None
