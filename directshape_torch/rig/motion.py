@@ -222,10 +222,6 @@ class MotionConstraint(FieldConstraint):
         """Another motion."""
         return replace(self, T_later_cam=exp(own_step) @ self.T_later_cam)
 
-    def known(self) -> tuple[Tensor, Tensor]:
-        """Nothing."""
-        return self.seen.new_zeros(()), self.seen.new_zeros(6)
-
     def _of_depths(self, inverse_depth: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Disparity and later pixel, predicted minus observed, in standard deviations (P, 3); its derivatives by the
         inverse depth (P, 3) and by the twist (P, 3, 6)."""

@@ -86,9 +86,9 @@ class FieldConstraint(ABC):
     def moved(self, own_step: Tensor) -> Self:
         """With its own unknowns changed."""
 
-    @abstractmethod
-    def known(self) -> tuple[Tensor, Tensor]:
+    def known(self) -> tuple[Tensor, Tensor] | None:
         """What else is known of the own unknowns: a residual () in standard deviations, and (M,) its derivative."""
+        return None
 
     @property
     def uv(self) -> Tensor:
@@ -103,12 +103,13 @@ class FieldConstraint(ABC):
         share = (_INDEPENDENT_POINTS / weight.sum().clamp_min(1e-9)).clamp_max(1.0) / scale**2
         weighted = (J * (share * weight)[:, None, None]).flatten(0, 1)
         H, g = weighted.T @ J.flatten(0, 1), weighted.T @ residual.flatten()
-        known, J_known = self.known()
-        J_known = torch.cat([J_known, J_known.new_zeros(NUM_COEFFICIENTS)])
+        if (known := self.known()) is not None:
+            J_known = torch.cat([known[1], known[1].new_zeros(NUM_COEFFICIENTS)])
+            H, g = H + torch.outer(J_known, J_known), g + J_known * known[0]
         # Of a distance in one dimension, or in the two that a depth of its own leaves of three.
         expected = 0.6745 if residual.shape[1] == 1 else math.sqrt(2 * math.log(2))
         spread = float(distances.median()) / expected if len(distances) else 1.0
-        return Linearisation(H + torch.outer(J_known, J_known), g + J_known * known, spread)
+        return Linearisation(H, g, spread)
 
     def observations(self, coefficients: Tensor, scale: float) -> Tensor:
         """What `pixel_evidence` takes (Q, 4), by the depths of the own unknowns, at the points that count."""

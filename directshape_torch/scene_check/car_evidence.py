@@ -14,6 +14,7 @@ from directshape_torch.geometry.box3d import rotation_y_from_pose
 from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.scene import Detections, FrameBatch, boxes_around
+from directshape_torch.stereo_matching.disparity import rgb8
 
 Side = Literal["left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
@@ -94,7 +95,14 @@ def _frame_evidence(
         camera=_camera_of(frames.camera, number),
         size_hw=size_hw,
         has_masks=True,
+        pair=_pair(frames, number, size_hw),
     )
+
+
+def _pair(frames: FrameBatch, number: int, size_hw: tuple[int, int]) -> Pair:
+    height, width = size_hw
+    left, right = (images[number, :, :height, :width] for images in (frames.images_left, frames.images_right))
+    return rgb8(left), rgb8(right)
 
 
 def _camera_of(camera: StereoCamera, number: int) -> StereoCamera:

@@ -9,14 +9,13 @@ import numpy as np
 
 from directshape_torch.numerics.checks import check_type
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.scene_check.car_evidence import FrameEvidence, Pair, evidence_of_scene
+from directshape_torch.scene_check.car_evidence import FrameEvidence, evidence_of_scene
 from directshape_torch.scene_check.check_boxes import check_box_2d, check_boxes, check_corners
 from directshape_torch.scene_check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, check_images
 from directshape_torch.scene_check.check_masks import check_masks
 from directshape_torch.scene_check.check_places import check_distances, check_heading, check_swapped, measure_cars
 from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, names
 from directshape_torch.scene_check.finding import found as found_mistake
-from directshape_torch.stereo_matching.disparity import rgb8
 
 
 def check_scene(frames: FrameBatch, detections: Detections, match_images: bool = True) -> CheckReport:
@@ -57,30 +56,23 @@ def check_scene(frames: FrameBatch, detections: Detections, match_images: bool =
     check_type("frames", frames, (FrameBatch,))
     check_type("detections", detections, (Detections,))
     check_type("match_images", match_images, (bool,))
-    frames, detections = frames.detach(), detections.detach()
-    found: list[Finding] = []
-    pairs: list[Pair] = []
-    for number, (height, width) in enumerate(frames.sizes.cpu().tolist()):
-        where = f"frame {frames.frame_ids[number]}"
-        camera = frames.camera
-        matrices = {"left": camera.K_left[number], "right": camera.K_right[number]}
-        as_numbers = {side: K.detach().double().cpu().numpy() for side, K in matrices.items()}
-        found += check_calibration(as_numbers, float(camera.baseline[number]), (height, width), where)
-        left, right = (images[number, :, :height, :width] for images in (frames.images_left, frames.images_right))
-        pairs.append((rgb8(left), rgb8(right)))
-    found = _once(found)
+    evidence = evidence_of_scene(frames.detach(), detections.detach())
+    found = _once([finding for one in evidence for finding in _check_camera(one)])
     usable = not names(found) & SPOILS_CAMERA
-    evidence = evidence_of_scene(frames, detections)
-    if match_images:
-        for one, pair in zip(evidence, pairs, strict=True):
-            found += check_images(*pair, one.camera if usable else None, f"frame {one.frame_id}")
+    for one in evidence:
+        if match_images and one.pair is not None:
+            found += check_images(*one.pair, one.camera if usable else None, f"frame {one.frame_id}")
     found += _mask_sizes(frames, detections)
     if usable and not names(found) & {"mask_size"}:
         spoilt = bool(names(found) & SPOILS_PAIR)
-        found += check_cars(
-            [replace(one, pair=None if spoilt else pair) for one, pair in zip(evidence, pairs, strict=True)]
-        )
+        found += check_cars([replace(one, pair=None) if spoilt else one for one in evidence])
     return CheckReport(by_severity(found), len(frames), len(frames), len(detections))
+
+
+def _check_camera(one: FrameEvidence) -> list[Finding]:
+    camera = one.camera
+    matrices = {"left": camera.K_left[0].numpy(), "right": camera.K_right[0].numpy()}
+    return check_calibration(matrices, float(camera.baseline[0]), one.size_hw, f"frame {one.frame_id}")
 
 
 def check_cars(frames: Sequence[FrameEvidence]) -> list[Finding]:
