@@ -53,24 +53,19 @@ def limits_in_words(limits: Mapping[str, float | str], group: Settings | None = 
     return " and ".join(f"{name.replace('_', ' ')} {value(limit)}" for name, limit in limits.items())
 
 
-@cache
-def _cached_type_hints(group: Any) -> dict[str, Any]:
-    return typing.get_type_hints(group)
-
-
-def type_hints(group: Any) -> dict[str, Any]:
-    """The types of a group's settings by name."""
-    return _cached_type_hints(group)
-
-
 @dataclass(frozen=True)
 class Settings:
     """A group of settings. Making one with a value that is not allowed is a `ConfigError` that names the key."""
 
+    @classmethod
+    @cache
+    def types(cls) -> dict[str, Any]:
+        """Of the settings by name."""
+        return typing.get_type_hints(cls)
+
     def __post_init__(self) -> None:
-        hints = type_hints(type(self))
         for each in fields(self):
-            value, hint = getattr(self, each.name), hints[each.name]
+            value, hint = getattr(self, each.name), self.types()[each.name]
             if typing.get_origin(hint) is Literal and value not in typing.get_args(hint):
                 raise ConfigError(f"{each.name}: expected one of {', '.join(typing.get_args(hint))}, got {value!r}")
             limits, entries = each.metadata.get("limits"), value if isinstance(value, tuple) else (value,)

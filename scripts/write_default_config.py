@@ -16,7 +16,7 @@ from typing import Any
 
 import yaml
 
-from directshape_torch.config import RefinerConfig, Settings, limits_in_words, type_hints
+from directshape_torch.config import RefinerConfig, Settings, limits_in_words
 from directshape_torch.io.config_files import config_to_mapping
 
 TARGET = Path(__file__).parent.parent / "directshape_torch" / "assets" / "configs" / "default.yaml"
@@ -76,7 +76,7 @@ def _setting(group: type[Settings], field: dataclasses.Field[Any], value: Any, i
 
 def _description(group: type[Settings], field: dataclasses.Field[Any]) -> str:
     # Brackets stay on one line.
-    allowed = [_kind(type_hints(group)[field.name]) + _unit(field.name), limits_in_words(field.metadata["limits"])]
+    allowed = [_kind(group.types()[field.name]) + _unit(field.name), limits_in_words(field.metadata["limits"])]
     return f"{field.metadata['description']} [{', '.join(filter(None, allowed)).replace(' ', _UNBROKEN)}]"
 
 

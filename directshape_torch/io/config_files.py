@@ -11,7 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from directshape_torch.config import RefinerConfig, Settings, type_hints
+from directshape_torch.config import RefinerConfig, Settings
 from directshape_torch.errors import ConfigError, shown
 from directshape_torch.files.read_files import read_text
 
@@ -47,7 +47,7 @@ def _from_mapping(cls: type[_GroupT], mapping: Mapping[str, Any], where: str, kn
     """The group whose keys follow `where`; `known`: names of all settings by their paths."""
     if not isinstance(mapping, Mapping):
         raise ConfigError(f"{where.rstrip('.') or 'configuration'}: expected keys and values, got {shown(mapping)}")
-    hints = type_hints(cls)
+    hints = cls.types()
     for key in mapping:
         if key not in hints:
             nearest = _nearest_key(str(key), {f"{where}{name}": name for name in hints}, known)
@@ -68,7 +68,7 @@ def _nearest_key(key: str, here: Mapping[str, str], known: Mapping[str, str]) ->
 
 def _leaves(cls: type[Any]) -> Iterator[str]:
     """Dotted paths of all settings; those of a list's entries as if there were one entry."""
-    for name, hint in type_hints(cls).items():
+    for name, hint in cls.types().items():
         kind = next((kind for kind in (hint, *typing.get_args(hint)) if _is_group(kind)), None)
         yield from [name] if kind is None else (f"{name}.{leaf}" for leaf in _leaves(kind))
 
