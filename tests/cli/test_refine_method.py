@@ -88,5 +88,5 @@ def test_frames_of_several_sizes_keep_their_maps(source: Path) -> None:
     np.testing.assert_array_equal(together[1], loaded[1].frame.disparity[0])  # type: ignore[index]
     bare = open_dataset("kitti", source, source / "detections", source / "masks").load("000000")
     assert collate([bare])[0].disparity is None
-    with pytest.raises(ValueError, match="loaded: expected frames with disparity maps, or frames without, got 1 of 2"):
+    with pytest.raises(ValueError, match="loaded: expected frames with disparity, or frames without, got 1 of 2"):
         collate([bare, loaded[1]])
