@@ -7,7 +7,7 @@ import importlib.metadata
 import time
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -16,7 +16,7 @@ from directshape_torch.batch.frame_outputs import failed_entry
 from directshape_torch.batch.group_refinement import GroupReport, RunJob, limited_threads, refine_group
 from directshape_torch.batch.options import RefineOptions, RunObserver
 from directshape_torch.batch.resumption import OUTPUT_FOLDERS, EarlierResults, remove_results, remove_unfinished_files
-from directshape_torch.batch.run_log import RunBeginning, RunLog, digit_warnings, read_log
+from directshape_torch.batch.run_log import RunBeginning, RunEvent, RunLog, digit_warnings, read_log
 from directshape_torch.batch.run_summary import RunSummary, RunTimings, find_warnings, write_timings
 from directshape_torch.batch.workers import LocalWorkers, reports_of
 from directshape_torch.errors import DirectShapeError, InputError
@@ -94,7 +94,7 @@ class _Run:
             groups = self._groups(resumed)
             if groups and resumed and before is not None:
                 self.warnings += digit_warnings(before[0], now)
-            self.log.refining(len(resumed))
+            self.log.add(RunEvent(time.time(), resumed=len(resumed)))
             self.observer.started([name for group in groups for name in group.frame_ids if name in group.wanted])
             if groups:
                 self._refine(groups)
@@ -136,7 +136,7 @@ class _Run:
         self.num_halved += report.num_halved
         for frame_id, entry in report.ends.items():
             self.frames[frame_id] = entry
-            self.log.frame(frame_id, entry.get("reason"))
+            self.log.add(RunEvent(time.time(), frame=frame_id, failure=entry.get("reason")))
             self.observer.finished(frame_id, entry.get("reason"))
         if report.stopped is not None:
             raise DirectShapeError(report.stopped)
@@ -147,7 +147,9 @@ class _Run:
             write_timings(self.out_dir, self.timings)
         self.earlier.write()
         summary = self._summary(resumed)
-        self.log.end(len(summary.frames) - len(summary.failed), summary.failed, reason)
+        end: Literal["finished", "stopped"] = "finished" if reason is None else "stopped"
+        num_done = len(summary.frames) - len(summary.failed)
+        self.log.add(RunEvent(time.time(), end=end, done=num_done, failed=summary.failed, reason=reason))
         return summary
 
     def _look_for_files(self) -> None:

@@ -165,18 +165,9 @@ class RunLog:
         start = json.loads(_BEGINNING.rstrip(b", ") + b"}")
         self._append({**start, "schema_version": LOG_SCHEMA_VERSION, **asdict(beginning)})
 
-    def refining(self, resumed: int) -> None:
-        """What earlier runs left is checked."""
-        self._append({"resumed": resumed, "at": time.time()})
-
-    def frame(self, frame_id: str, failure: str | None) -> None:
-        """A frame has ended."""
-        self._append({"frame": frame_id, "at": time.time(), "failure": failure})
-
-    def end(self, done: int, failed: Mapping[str, str], reason: str | None) -> None:
-        """The run has ended; of one that was stopped with the reason."""
-        end = "finished" if reason is None else "stopped"
-        self._append({"end": end, "at": time.time(), "done": done, "failed": dict(failed), "reason": reason})
+    def add(self, event: RunEvent) -> None:
+        """Write a later line."""
+        self._append({name: value for name, value in asdict(event).items() if value is not None})
 
     def _append(self, content: Mapping[str, Any]) -> None:
         """All of a line or, where that fails, nothing."""

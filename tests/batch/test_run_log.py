@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from directshape_torch.batch.run_log import OutputLostError, RunBeginning, RunLog, log_path, read_log
+from directshape_torch.batch.run_log import OutputLostError, RunBeginning, RunEvent, RunLog, log_path, read_log
 from directshape_torch.batch.run_status import read_status
 from directshape_torch.errors import DataFormatError, RunInProgressError
 
@@ -52,10 +52,10 @@ def written(out: Path) -> bytes:
     """A log of three frames, one of which fails."""
     with RunLog(out) as log:
         log.begin(RunBeginning({"threads": 1}, 5))
-        log.refining(2)
+        log.add(RunEvent(1.0, resumed=2))
         for frame_id, failure in (("000000", None), ("000001", "cut short"), ("000002", None)):
-            log.frame(frame_id, failure)
-        log.end(4, {"000001": "cut short"}, None)
+            log.add(RunEvent(2.0, frame=frame_id, failure=failure))
+        log.add(RunEvent(3.0, end="finished", done=4, failed={"000001": "cut short"}))
     return log_path(out).read_bytes()
 
 
@@ -126,10 +126,10 @@ def test_what_a_full_disk_took_of_a_line_is_taken_back(tmp_path: Path) -> None:
         whole, file = log_path(tmp_path).read_bytes(), log._file
         log._file = Disk(file)  # type: ignore[assignment]
         with pytest.raises(OutputLostError, match=r"No space left.*run the same command again"):
-            log.refining(2)
+            log.add(RunEvent(1.0, resumed=2))
         assert log_path(tmp_path).read_bytes() == whole
         log._file = file
-        log.refining(2)
+        log.add(RunEvent(1.0, resumed=2))
     found = read_log(tmp_path)
     assert found is not None
     assert [event.resumed for event in found[1]] == [2]
