@@ -20,7 +20,7 @@ from helpers.synthetic_scene import (
 )
 
 from directshape_torch.config import RefinerConfig, SearchConfig
-from directshape_torch.errors import InputError, NoGradientWarning
+from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
@@ -175,11 +175,3 @@ def test_wrong_inputs_are_named() -> None:
     small = {name: getattr(scene.detections, name)[:, :50] for name in ("mask_left", "mask_right")}
     with pytest.raises(InputError, match="masks of the \\(padded\\) image size"):
         module(scene.frames, replace(scene.detections, **small))
-
-
-def test_no_gradient_graph_is_built() -> None:
-    scene = cached_street()[1]
-    pose = scene.detections.T_cam_obj.clone().requires_grad_()
-    with pytest.warns(NoGradientWarning, match=r"detections.T_cam_obj get no gradient"):
-        result = refiner()(scene.frames, replace(scene.detections, T_cam_obj=pose))
-    assert not result.T_cam_obj.requires_grad

@@ -7,11 +7,10 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.projection import project
-from directshape_torch.laboratory.bench import TERM_NAMES, Bench, near_border
-from directshape_torch.laboratory.regimes import REGIMES, checked_name, regimes_named
+from directshape_torch.laboratory.bench import Bench, near_border
+from directshape_torch.laboratory.regimes import REGIMES
 from directshape_torch.laboratory.scenes import LaboratoryScene
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
@@ -72,10 +71,3 @@ def test_draws_repeat_and_do_not_depend_on_other_regimes(scene: LaboratoryScene,
     assert torch.equal(first.state.T_obj_cam, again.state.T_obj_cam)
     assert torch.equal(first.problem.masks.rays.ray_cam, again.problem.masks.rays.ray_cam)
     assert not torch.equal(first.state.T_obj_cam, other.state.T_obj_cam)
-
-
-def test_unknown_names_list_the_known_ones() -> None:
-    with pytest.raises(InputError, match=r"regime: expected one of typical, near_optimum, .*got 'far'.*far_80m"):
-        regimes_named(["far"])
-    with pytest.raises(InputError, match="the nearest is photometric"):
-        checked_name("term", "fotometric", list(TERM_NAMES))

@@ -1,4 +1,4 @@
-"""The bounds hold on a small draw, for every factor and term; a wrong Jacobian of any of them is seen."""
+"""The bounds hold on a small draw, for every factor and term; `mutate_jacobians.py` says that wrong ones break them."""
 
 from __future__ import annotations
 
@@ -177,16 +177,6 @@ def test_a_depth_that_is_not_attached_is_seen(bench_of: BenchOf, monkeypatch: py
     with torch.no_grad():
         (found,) = compare(gradient_experiment(bench_of("typical"), ["photometric"]), "typical")
     assert found.errors["analytic-numeric"] > 1e-2
-
-
-def test_every_wrong_jacobian_is_seen(bench_of: BenchOf) -> None:
-    """One unknown of each term with its sign flipped: the comparison by itself, without differencing again."""
-    for subject in term_experiment(bench_of("contour"), TERM_NAMES).subjects:
-        J = subject.analytic.clone()
-        J[:, int(J.abs().sum(dim=0).argmax())] *= -1
-        wrong = replace(subject, analytic=J)
-        error = ((wrong.analytic - wrong.autograd).abs() / wrong.norm.clamp_min(1e-300)[:, None]).max()
-        assert error > 1e-3, subject.name
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-7, 0.7, 3.1415926])

@@ -8,8 +8,7 @@ import check_backward as script
 import pytest
 import torch
 
-from directshape_torch import DirectShapeRefiner, load_config
-from directshape_torch.solver.differentiate import StartNotReachedWarning
+from directshape_torch import load_config
 
 
 @pytest.fixture(scope="module")
@@ -26,13 +25,6 @@ def test_all_seven_numbers_of_a_box_have_the_gradient_of_the_refinement(scene: s
     assert found.abs().min() > 1e-3
     assert float(((found - numeric).abs() / numeric.abs()).median()) < 1e-4
     assert float(((found - numeric).abs() / numeric.abs()).max()) < 0.05
-
-
-def test_a_start_that_is_not_reached_is_named(scene: script.Scene) -> None:
-    config = load_config("default", ["backward.mode=unroll", "backward.unroll_iterations=2", *script.THINNED[1:]])
-    detections = replace(scene.detections, T_cam_obj=scene.detections.T_cam_obj.clone().requires_grad_())
-    with pytest.warns(StartNotReachedWarning, match=r"problems 0 have no gradient.*backward\.unroll_iterations"):
-        DirectShapeRefiner(scene.prior, config)(scene.frames, detections)
 
 
 def test_a_row_tells_jumps_from_errors_and_cars_without_a_gradient() -> None:

@@ -52,9 +52,12 @@ def test_a_wrong_jacobian_makes_the_exit_code_one(
 def test_a_term_of_ones_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As the command names it; one whose Jacobian has too few rows is wrong use, and says so."""
+    """As the command names it; a wrong one breaks bounds, and one whose Jacobian has too few rows is wrong use."""
     (tmp_path / "a_term_of_my_own.py").write_text(
         "from directshape_torch.terms.priors import PriorTerm, height_prior\n\n\n"
+        "def negative(cars, state):\n    at = height_prior(cars, state)\n"
+        "    return at._replace(J_residual_state=-at.J_residual_state)\n\n\n"
+        "def wrong(frames, detections, cars, prior):\n    return PriorTerm('mine', 2.0, cars, negative, 1)\n\n\n"
         "def make(frames, detections, cars, prior):\n    return PriorTerm('mine', 2.0, cars, height_prior, 1)\n\n\n"
         "def misshapen(frames, detections, cars, prior):\n"
         "    return PriorTerm('mine', 2.0, cars, height_prior, 3)\n"
@@ -64,12 +67,16 @@ def test_a_term_of_ones_own(
     printed = capsys.readouterr().out
     assert "| mine |" in printed
     assert "gradient of mine" in printed
+    assert script.main([*_QUICK, "--term", "a_term_of_my_own:wrong"]) == 1
+    assert "- mine, far_80m: analytic-numeric error 2.0e+00" in capsys.readouterr().out
     assert script.main([*_QUICK, "--term", "a_term_of_my_own:misshapen"]) == 2
     assert "extra term 'mine': linear(...).residual: expected shape (1, 3, 1), got (1, 1, 1)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("option", "message"), [
     (["--term", "fotometric"], "term: expected one of exp, .*photometric, .*got 'fotometric'.*nearest is photometric"),
+    (["--term", "no_such_module:f"], "--term: expected module:factory, got 'no_such_module:f'"),
+    (["--term", "json:nothing_here"], "--term: expected module:factory, got 'json:nothing_here'"),
     (["--regime", "mars"], "regime: expected one of typical, .*got 'mars'"),
     (["--regime", "code_zero", "--term", "path"], "regime: expected one that has path, got code_zero.*track"),
     (["--states", "0"], "--states: expected at least 1"),
