@@ -14,7 +14,7 @@ from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.report.page_parts import FRAME_QUALITY, data_url, mesh_data, numbers
 from directshape_torch.visualize.drawing import View, draw_box, draw_contour
 from directshape_torch.visualize.drawn_car import DrawnCar
-from directshape_torch.visualize.residuals import ResidualMaps, draw_residuals
+from directshape_torch.visualize.residuals import draw_residuals, residual_maps
 from directshape_torch.visualize.run_frames import RunFrame
 
 _THUMBNAIL_PX = (360, 240)
@@ -85,10 +85,12 @@ def _maps(
     rows = [row for row, states in enumerate(cars) if states["after"].is_refined and parts[row] is not None]
     if frame.loaded is None or frame.inputs.prior is None or not rows:
         return pictures
-    maps = ResidualMaps(frame.loaded, frame.inputs.prior, config, torch.tensor(rows))
-    for name in cars[rows[0]]:
+    names, of_names = list(cars[rows[0]]), []
+    for name in names:
         states = [cars[row][name] for row in rows]
-        found = maps.of(np.stack([car.T_cam_obj for car in states]), np.stack([car.code for car in states]))
+        of_names.append((np.stack([car.T_cam_obj for car in states]), np.stack([car.code for car in states])))
+    maps = residual_maps(frame.loaded, frame.inputs.prior, config, torch.tensor(rows), of_names)
+    for name, found in zip(names, maps, strict=True):
         for row, residuals in zip(rows, found, strict=True):
             for kind, key in (("photometric", "photometric"), ("silhouette_left", "silhouette")):
                 part = parts[row]

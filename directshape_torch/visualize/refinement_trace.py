@@ -71,8 +71,8 @@ class RefinementTrace:
     @torch.no_grad()
     def residuals(self, number: int) -> dict[int, CarResiduals]:
         """What the images say of state `number` of each car that took part, by its row among the detections."""
-        state = CarState(*(x[self.rows] for x in self.states[number]))
-        return dict(zip(self.rows.tolist(), car_residuals(self.last_stage, self.pixels, state), strict=True))
+        sight = self.last_stage.problem.look(CarState(*(x[self.rows] for x in self.states[number])))
+        return dict(zip(self.rows.tolist(), car_residuals(self.last_stage, self.pixels, sight), strict=True))
 
     def place_of(self, car: int) -> int:
         """Number of a car among those that took part; -1 if it did not."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -22,7 +23,7 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.photometric import Photometric, Surface
-from directshape_torch.terms.term import Part
+from directshape_torch.terms.term import Part, Sight
 from directshape_torch.visualize.drawing import Array, View, blue_white_red
 
 WORST_SILHOUETTE = 4.6
@@ -65,9 +66,9 @@ _Pixels = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 @torch.no_grad()
-def car_residuals(stage: CarStage, pixels: Observation, state: CarState) -> list[CarResiduals]:
-    """Residuals of R cars in a state, at a stage that has begun with these pixels."""
-    figures, masks = stage.figures(stage.problem.look(state)), stage.problem.masks
+def car_residuals(stage: CarStage, pixels: Observation, sight: Sight) -> list[CarResiduals]:
+    """Residuals of R cars at what is seen of a state, at a stage that has begun with these pixels."""
+    figures, masks = stage.figures(sight), stage.problem.masks
     nothing = torch.zeros(0)
     parts: dict[str, _Pixels] = dict.fromkeys(
         CarResiduals._fields, (nothing, nothing.view(0, 2), nothing, nothing.bool())
@@ -81,7 +82,8 @@ def car_residuals(stage: CarStage, pixels: Observation, state: CarState) -> list
         elif isinstance(term, Photometric):
             parts["photometric"] = _of_photometry(term, at)
     return [
-        CarResiduals(*(_of_car(parts[name], car) for name in CarResiduals._fields)) for car in range(len(state.code))
+        CarResiduals(*(_of_car(parts[name], car) for name in CarResiduals._fields))
+        for car in range(len(sight.state.code))
     ]
 
 
@@ -101,35 +103,31 @@ def _of_photometry(term: Photometric, at: Part) -> _Pixels:
     return car[counted], left.pixels.uv[pixel[counted]], mean[counted], ~Surface(*at.where).usable[counted]
 
 
-class ResidualMaps:
-    """Residuals of the cars of a frame in any state, at pixels that are evenly spaced over their regions.
+@torch.no_grad()
+def residual_maps(
+    loaded: LoadedFrame,
+    prior: ShapePrior,
+    config: RefinerConfig,
+    rows: Tensor,  # (R,) detections that have a pose
+    states: Iterable[tuple[Array, Array]],  # poses (R, 4, 4) and shapes (R, K)
+) -> list[list[CarResiduals]]:
+    """For each of the states the residuals of R cars, at pixels that are evenly spaced over their regions.
 
-    Args:
-        loaded: the frame, with the detections whose masks the cars have.
-        prior: the shapes of the states.
-        config: of the refinement.
-        rows: the detections (R,) that have a pose.
+    Masks are those of the detections; photometric pixels are those of the car as it is in the state.
     """
-
-    def __init__(self, loaded: LoadedFrame, prior: ShapePrior, config: RefinerConfig, rows: Tensor) -> None:
-        sampling = replace(config.sampling, mode="uniform", mode_right="uniform", density=1.0, max_pixels=_MOST_PIXELS)
-        config = replace(config, method="direct", compile="off", sampling=sampling)
-        frame, detections = loaded.frame, loaded.detections
-        chosen = torch.zeros(len(detections), dtype=torch.bool).index_fill(0, rows, True)
-        with torch.no_grad(), full_precision(frame.images_left.device.type):
-            problem, self._input = DirectShapeRefiner(prior, config).problem(frame, detections)
-            self._problem, self._stage = problem.of_problems(chosen), config.stages[-1]
-            self._pixels = pack_pixels(frame, without_empty_masks(detections), sampling).of_objects(chosen)
-        self._rows = rows
-
-    @torch.no_grad()
-    def of(self, T_cam_obj: Array, codes: Array) -> list[CarResiduals]:
-        """Of states (R, 4, 4) and (R, K); photometric pixels are those of the car as it is there."""
-        start = CarState(*(x[self._rows] for x in self._input))
-        poses, shapes = (torch.from_numpy(np.asarray(x)).to(start.code) for x in (T_cam_obj, codes))
-        state = start._replace(T_obj_cam=se3.inverse(poses), code=shapes)
-        stage = self._problem.begin(self._stage, self._problem.look(state))
-        return car_residuals(stage, self._pixels, state)
+    sampling = replace(config.sampling, mode="uniform", mode_right="uniform", density=1.0, max_pixels=_MOST_PIXELS)
+    config = replace(config, method="direct", compile="off", sampling=sampling)
+    frame, detections = loaded.frame, loaded.detections
+    chosen, found = torch.zeros(len(detections), dtype=torch.bool).index_fill(0, rows, True), []
+    with full_precision(frame.images_left.device.type):
+        of_all, inputs = DirectShapeRefiner(prior, config).problem(frame, detections)
+        problem, start = of_all.of_problems(chosen), CarState(*(x[rows] for x in inputs))
+        pixels = pack_pixels(frame, without_empty_masks(detections), sampling).of_objects(chosen)
+        for state in states:
+            poses, codes = (torch.from_numpy(np.asarray(x)).to(start.code) for x in state)
+            sight = problem.look(start._replace(T_obj_cam=se3.inverse(poses), code=codes))
+            found.append(car_residuals(problem.begin(config.stages[-1], sight), pixels, sight))
+    return found
 
 
 def silhouette_colours(values: PixelResiduals) -> NDArray[np.uint8]:

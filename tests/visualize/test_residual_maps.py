@@ -14,7 +14,7 @@ from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.visualize.drawing import View
 from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
-from directshape_torch.visualize.residuals import CarResiduals, PixelResiduals, ResidualMaps, draw_residuals
+from directshape_torch.visualize.residuals import CarResiduals, PixelResiduals, draw_residuals, residual_maps
 
 _CAR = 2
 _ROWS = torch.tensor([0, _CAR])
@@ -35,10 +35,10 @@ def trace(loaded: LoadedFrame) -> RefinementTrace:
 def at_the_end(
     loaded: LoadedFrame, trace: RefinementTrace, shift_m: tuple[float, float, float] = (0, 0, 0), *words: str
 ) -> CarResiduals:
-    maps = ResidualMaps(loaded, trace.result.prior, load_config("fast", list(words)), _ROWS)
     T_cam_obj = trace.result.T_cam_obj[_ROWS].numpy().copy()
     T_cam_obj[:, :3, 3] += shift_m
-    return maps.of(T_cam_obj, trace.result.code[_ROWS].numpy())[1]
+    states, config = [(T_cam_obj, trace.result.code[_ROWS].numpy())], load_config("fast", list(words))
+    return residual_maps(loaded, trace.result.prior, config, _ROWS, states)[0][1]
 
 
 def mean(values: PixelResiduals) -> float:
