@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -187,16 +187,11 @@ def _masks_of_lines(loaded: LoadedFrame) -> dict[int, NDArray[np.bool_]]:
 
 
 def _subdivided(mesh: trimesh.Trimesh, view: FrameView) -> trimesh.Trimesh:
-    import trimesh
-
-    subdivide: Callable[..., tuple[NDArray[Any], ...]] = trimesh.remesh.subdivide
-    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     depth = max(float(mesh.vertices[:, 2].mean()), 1.0)
     edge_px = float(mesh.edges_unique_length.mean()) * float(view.left.K[0, 0]) / depth
-    times = int(np.clip(np.ceil(np.log2(edge_px / _EDGE_PX)), 0, _MOST_SUBDIVISIONS))
-    for _ in range(times):
-        vertices, faces = subdivide(vertices, faces)[:2]
-    return trimesh.Trimesh(vertices, faces, process=False)
+    for _ in range(int(np.clip(np.ceil(np.log2(edge_px / _EDGE_PX)), 0, _MOST_SUBDIVISIONS))):
+        mesh = mesh.subdivide()
+    return mesh
 
 
 def _mirror(paint: Paint, points_obj: Points) -> None:
