@@ -112,17 +112,15 @@ def test_views_of_a_track_get_one_shape_that_is_nearer_to_the_truth() -> None:
     assert (together.observability.sigmas_m.amax(dim=1) < alone.observability.sigmas_m.amax(dim=1)).all()
 
 
-@pytest.mark.parametrize("time_s", [None, (0.0, 0.1, 0.2)])
-def test_the_evidence_of_a_view_is_that_of_its_own_unknowns(time_s: tuple[float, ...] | None) -> None:
+def test_the_evidence_of_a_view_is_that_of_its_own_unknowns() -> None:
     frames, detections, _ = drive()
-    if time_s is not None:
-        frames = replace(frames, time_s=torch.tensor(time_s, dtype=torch.float64))
+    timed = replace(frames, time_s=torch.tensor([0.0, 0.1, 0.2], dtype=torch.float64))
     track = replace(detections, track_id=torch.tensor([0, 1] * 3))
-    result = DirectShapeRefiner(ellipsoid_prior(), DEFAULT)(frames, track)
-    assert result.track_part.tolist() == [0] * 6
-    # Nobody said how good the detector is.
-    unknown = [name for name, x in zip(EVIDENCE_NAMES, result.quality.evidence.mT, strict=True) if x.isnan().any()]
-    assert unknown == ["log_detector_sigma"]
+    for result in (of_tracks(*[0, 1] * 3), DirectShapeRefiner(ellipsoid_prior(), DEFAULT)(timed, track)):
+        assert result.track_part.tolist() == [0] * 6
+        # Nobody said how good the detector is.
+        unknown = [name for name, x in zip(EVIDENCE_NAMES, result.quality.evidence.mT, strict=True) if x.isnan().any()]
+        assert unknown == ["log_detector_sigma"]
 
 
 def test_a_batch_of_tracks_equals_a_loop() -> None:

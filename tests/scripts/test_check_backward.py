@@ -5,20 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import check_backward as script
-import pytest
 import torch
 
 from directshape_torch import load_config
 
 
-@pytest.fixture(scope="module")
-def scene() -> script.Scene:
-    return script.Scene.of_demo(1)
-
-
-def test_all_seven_numbers_of_a_box_have_the_gradient_of_the_refinement(scene: script.Scene) -> None:
+def test_all_seven_numbers_of_a_box_have_the_gradient_of_the_refinement() -> None:
     """As shipped but for the number of pixels: mode `unroll` and nothing else."""
     config = load_config("default", ["backward.mode=unroll", *script.THINNED[1:]])
+    scene = script.Scene.of_demo(1)
     scene = replace(scene, detections=replace(scene.detections, pose_sigma=None))
     found = script.gradients(scene, config, script.BOX)
     numeric = script.differences(scene, config, 2.5e-7, script.BOX)
