@@ -43,6 +43,7 @@ from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.estimate import RigEstimates
 from directshape_torch.rig.rig_file import load_rigs
+from directshape_torch.shape.load_prior import load_prior
 
 _WORSE = 0.05
 _WITHIN_SIGMAS = 2.0
@@ -93,7 +94,7 @@ def run(args: argparse.Namespace) -> None:
     dataset = open_dataset(
         args.layout, args.data, args.detections, args.masks, tracks=True, split=args.split, frames=args.frames
     )
-    refiner = DirectShapeRefiner(config=load_config(None, args.set))
+    refiner = DirectShapeRefiner(load_prior(args.prior), load_config(None, args.set))
     if args.rig is not None:
         rigs = load_rigs(args.rig)
         dataset = replace(dataset, disparity_fields=tuple(rig.field for rig in rigs))
@@ -303,6 +304,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--interval", type=float, metavar="SECONDS", help="between frames; default: not known")
     parser.add_argument("--swap", action="store_true", help="exchange two tracks half way")
     parser.add_argument("--rig", type=Path, metavar="FILE", help="of 'calibrate-rig' or a run; default: none")
+    parser.add_argument("--prior", default="pca", metavar="FILE|NAME", help="shapes (default: %(default)s)")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings, as of 'refine'")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")

@@ -106,9 +106,10 @@ def test_views_of_a_track_get_one_shape_that_is_nearer_to_the_truth() -> None:
     off = ellipsoid_prior().dimensions_and_derivative(together.code).hwl - detections.dimensions_hwl
     off = off / torch.tensor(priors.dimensions_sigma_m)
     torch.testing.assert_close(costs["dimensions"], priors.dimensions_weight * off.square().sum(dim=1) / 2)
-    # What the other views say counts: no direction is known less.
+    # What the other views say counts: no direction is known less, and none better than what views have in common.
     variances = [result.covariance.diagonal(dim1=1, dim2=2)[:, 6:] for result in (alone, together)]
     assert (variances[1] < variances[0]).all()
+    assert (variances[1] > variances[0] / 2).all()
     assert (together.observability.sigmas_m.amax(dim=1) < alone.observability.sigmas_m.amax(dim=1)).all()
 
 
