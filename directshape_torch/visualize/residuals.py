@@ -124,8 +124,8 @@ def residual_maps(
         problem, start = of_all.of_problems(chosen), CarState(*(x[rows] for x in inputs))
         pixels = pack_pixels(frame, without_empty_masks(detections), sampling).of_objects(chosen)
         for state in states:
-            poses, codes = (torch.from_numpy(np.asarray(x)).to(start.code) for x in state)
-            sight = problem.look(start._replace(T_obj_cam=se3.inverse(poses), code=codes))
+            T_cam_obj, code = (torch.from_numpy(np.asarray(x)).to(start.code) for x in state)
+            sight = problem.look(start._replace(T_obj_cam=se3.inverse(T_cam_obj), code=code))
             found.append(car_residuals(problem.begin(config.stages[-1], sight), pixels, sight))
     return found
 
