@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, is_dataclass
 from typing import Any, Generic, Literal, ParamSpec, TypeVar
 
 import torch
@@ -177,26 +177,29 @@ def with_varying(value: _T, axes_of: Callable[[Tensor], Iterable[int]]) -> _T:
     """The same tensor, named tuple or dataclass, with the axes marked whose sizes vary from call to call."""
 
     def of_record(record: Any) -> Any:
-        if not is_dataclass(record) or isinstance(record, type):
+        if not is_dataclass(record):
             return record
         copy = object.__new__(type(record))
-        for part in fields(record):
-            object.__setattr__(copy, part.name, with_varying(getattr(record, part.name), axes_of))
+        vars(copy).update({name: walked(part, name) for name, part in vars(record).items()})
         return copy
 
-    return _walked(value, "", lambda tensor, _: _with_marks(tensor, axes_of(tensor)), of_record)  # type: ignore[no-any-return]
+    walked = _walker(lambda tensor, _: _with_marks(tensor, axes_of(tensor)), of_record)
+    return walked(value, "")  # type: ignore[no-any-return]
 
 
-def _walked(value: Any, name: str, of_tensor: Callable[[Tensor, str], Any], of_other: Callable[[Any], Any]) -> Any:
-    """The same tuple or named tuple, nested or not, with what becomes of each tensor, by its name, and of the rest."""
-    if isinstance(value, Tensor):
-        return of_tensor(value, name)
-    if not isinstance(value, tuple):
-        return of_other(value)
-    own_names = getattr(value, "_fields", None)
-    names = [name] * len(value) if own_names is None else own_names
-    parts = [_walked(part, called, of_tensor, of_other) for called, part in zip(names, value, strict=True)]
-    return type(value)(parts) if own_names is None else type(value)(*parts)
+def _walker(of_tensor: Callable[[Tensor, str], Any], of_other: Callable[[Any], Any]) -> Callable[[Any, str], Any]:
+    """Makes of nested tuples and named tuples the same of what becomes of each tensor, by its name, and of the rest."""
+
+    def walked(value: Any, name: str) -> Any:
+        if isinstance(value, Tensor):
+            return of_tensor(value, name)
+        if not isinstance(value, tuple):
+            return of_other(value)
+        if hasattr(value, "_fields"):
+            return type(value)(*map(walked, value, value._fields))
+        return tuple([walked(part, name) for part in value])
+
+    return walked
 
 
 def _with_marks(tensor: Tensor, axes: Iterable[int]) -> Tensor:
@@ -306,7 +309,7 @@ def _prepared(value: Any, name: str, sizes: Mapping[str, int]) -> Any:
         # What the compiler cannot look into is another one at each call.
         raise _StaysPlainError
 
-    return _walked(value, name, of_tensor, of_other)
+    return _walker(of_tensor, of_other)(value, name)
 
 
 def _compiled(function: Callable[_P, _R], on_compilation: Callable[[int], None]) -> Callable[_P, _R]:

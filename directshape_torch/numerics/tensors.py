@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from functools import wraps
 from typing import Any, TypeVar
@@ -91,7 +90,7 @@ def all_along(flags: Tensor, dim: int) -> Tensor:
     """`flags.all(dim)` of an axis with few entries."""
     if torch.compiler.is_compiling():
         return flags.all(dim)  # one step to trace, and the compiler writes the loop
-    return functools.reduce(torch.logical_and, flags.unbind(dim))
+    return flags.view(torch.uint8).amin(dim).view(torch.bool)
 
 
 def not_negative(values: Tensor) -> Tensor:

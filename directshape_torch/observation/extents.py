@@ -62,21 +62,28 @@ def mask_extents(
     _check_sizes(masks, names)
     # The same memory, in a type of which maxima are fast.
     stacks = [stack.view(torch.uint8) if stack.dtype == torch.bool else stack.detach() for stack in masks]
-    highest = [stack.amax(dim=2) for stack in stacks]
-    _check_probabilities(highest, present, names)
-    in_rows = [_is_foreground(rows) & exists[:, None] for rows, exists in zip(highest, present, strict=True)]
-    v0, v1 = _first_and_end(torch.cat(in_rows))
+    exists = iter(torch.cat(list(present)).tolist())
+    highest = [_row_maxima(stack, [next(exists) for _ in stack]) for stack in stacks]
+    _check_probabilities(highest, names)
+    v0, v1 = _first_and_end(torch.cat([_is_foreground(rows) for rows in highest]))
     every_mask = [mask for stack in stacks for mask in stack]
     # From here on what has foreground alone is read.
-    strips = [mask[top:end] for mask, top, end in zip(every_mask, v0.tolist(), v1.tolist(), strict=True)]
+    strips = [mask[top:end] for mask, top, end in zip(every_mask, *torch.stack([v0, v1]).tolist(), strict=True)]
     nothing = torch.zeros(masks[0].shape[2], dtype=torch.bool, device=v0.device)
     in_columns = [_is_foreground(strip.amax(dim=0)) if len(strip) else nothing for strip in strips]
     u0, u1 = _first_and_end(torch.stack(in_columns) if strips else nothing[None][:0])
-    spans = zip(strips, u0.tolist(), u1.tolist(), strict=True)
+    spans = zip(strips, *torch.stack([u0, u1]).tolist(), strict=True)
     areas = torch.stack([v0.new_zeros(()), *(_is_foreground(strip[:, left:end]).sum() for strip, left, end in spans)])
     lengths = [len(stack) for stack in stacks]
     boxes = torch.stack([u0, v0, u1, v1], dim=1).split_with_sizes(lengths)
     return [MaskExtents(*part) for part in zip(boxes, areas[1:].split_with_sizes(lengths), strict=True)]
+
+
+def _row_maxima(stack: Tensor, present: Sequence[bool]) -> Tensor:
+    """Of each row of masks, (I, H); 0 for those that are not there, whose memory is left alone."""
+    nothing = stack.new_zeros(stack.shape[1])
+    rows = [mask.amax(dim=1) if exists else nothing for mask, exists in zip(stack, present, strict=True)]
+    return torch.stack(rows) if rows else stack[:, :, 0]
 
 
 def _is_foreground(values: Tensor) -> Tensor:
@@ -100,13 +107,12 @@ def _check_sizes(masks: Sequence[Tensor], names: Sequence[str]) -> None:
             raise InputError(name, f"masks of the size of {names[0]} {(height, width)}", f"{tuple(stack.shape[1:])}")
 
 
-def _check_probabilities(highest: Sequence[Tensor], present: Sequence[Tensor], names: Sequence[str]) -> None:
-    """Raise `InputError` for masks that are there with more than a probability in the maximum (I, H) of a row."""
-    too_high = [(rows > _HIGHEST_PROBABILITY) & exists[:, None] for rows, exists in zip(highest, present, strict=True)]
-    if not bool(torch.stack([rows.any() for rows in too_high]).any()):
+def _check_probabilities(highest: Sequence[Tensor], names: Sequence[str]) -> None:
+    """Raise `InputError` for more than a probability in the maxima (I, H) of the rows of masks."""
+    if not bool(torch.stack([(rows > _HIGHEST_PROBABILITY).any() for rows in highest]).any()):
         return
-    name, rows, wrong = next(x for x in zip(names, highest, too_high, strict=True) if x[2].any())
-    values = rows.where(wrong, torch.zeros_like(rows)).amax(dim=1)
+    name, rows = next(x for x in zip(names, highest, strict=True) if (x[1] > _HIGHEST_PROBABILITY).any())
+    values = rows.nan_to_num(0.0, posinf=torch.inf).amax(dim=1)
     row = int(values.argmax())
     got = f"a value of {float(values[row]):g} in mask {row}"
     raise InputError(name, "foreground probabilities in [0, 1]", got, "apply a sigmoid to logits, or divide by 255")

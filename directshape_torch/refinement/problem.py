@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -141,10 +142,14 @@ class CarStage:
         ]
         return torch.stack(seen).sum(dim=0) if seen else None
 
+    @cached_property
+    def _constant_terms(self) -> tuple[Term, ...]:
+        """The terms as compiled code takes them; those of the stage may be differentiated."""
+        return tuple(with_varying_blocks(term) for term in self.terms)
+
     def figures(self, sight: Sight) -> Figures:
         """The energy at a state, column by column, with every ray marched; differentiable where gradients are on."""
-        # The marked terms are constants, so those of the stage, which may be differentiated, stay as they are.
-        terms = self.terms if torch.is_grad_enabled() else tuple(with_varying_blocks(term) for term in self.terms)
+        terms = self.terms if torch.is_grad_enabled() else self._constant_terms
         wheres = tuple(term.where(sight) for term in terms)
         parts = self.problem.parts(terms, sight.field, sight.state, wheres)
         layout = _Layout.of(self.terms, self.problem.factors)
@@ -321,11 +326,14 @@ class CarIterations:
         """The new evaluation of cars whose step was accepted (B,), the old one of the others."""
         conditions = accepted, accepted[:, None], accepted[:, None, None]
         cost, gradient, hessian = (torch.where(*x) for x in zip(conditions, new[:3], old[:3], strict=True))
-        wheres = []
-        for term, *where in zip(self.terms, new.wheres, old.wheres, strict=True):
+
+        def chosen(term: Term, new: Where, old: Where) -> Where:
+            if not new:  # looks nowhere
+                return new
             in_blocks = accepted[term.blocks.owner][:, None]
-            wheres.append(map_tensors(lambda x, y, chosen=in_blocks: torch.where(chosen, x, y), *where))
-        return Evaluation(cost, gradient, hessian, tuple(wheres))
+            return map_tensors(lambda x, y: torch.where(in_blocks, x, y), new, old)
+
+        return Evaluation(cost, gradient, hessian, tuple(map(chosen, self.terms, new.wheres, old.wheres)))
 
     def retract(self, state: CarState, step: Tensor) -> CarState:
         """The state moved by tangent vectors (B, D) within the trust region."""
@@ -339,17 +347,17 @@ class CarIterations:
     def of_problems(self, keep: Tensor, numbers: Sequence[int], at: Evaluation) -> tuple[CarIterations, Evaluation]:
         """Those of the cars where `keep` (B,) holds, `numbers` of them, with their evaluation."""
         index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
-        kept = [term.blocks.of_cars(keep, numbers)[1] for term in self.terms]
-        wheres = tuple(
-            map_tensors(lambda x, blocks=blocks: x.index_select(-2, blocks), where)
-            for where, blocks in zip(at.wheres, kept, strict=True)
-        )
+
+        def kept(term: Term, where: Where) -> Where:
+            blocks = term.blocks.of_cars(keep, numbers)[1] if where else None
+            return map_tensors(lambda x: x.index_select(-2, blocks), where)
+
         rest, factors = (None if x is None else x.index_select(0, index) for x in (self.rest, self.factors))
         masks = self.masks if self.rest is not None else self.masks.of_cars(keep, numbers)
         terms = tuple(term.of_cars(keep, numbers) for term in self.terms)
         cost, gradient, hessian = (x.index_select(0, index) for x in at[:3])
         iterations = CarIterations.of(self.stage, terms, rest, factors, masks, self.sharing.of_problems(numbers))
-        return iterations, Evaluation(cost, gradient, hessian, wheres)
+        return iterations, Evaluation(cost, gradient, hessian, tuple(map(kept, self.terms, at.wheres)))
 
 
 def method_stages(config: RefinerConfig) -> list[StageConfig]:

@@ -160,13 +160,13 @@ def iterate(
         has_settled, exhausted = ~p.stretched & (has_settled | at_rest), exhausted & ~p.stretched
         p.stretched = downhill & ~small_decrease
     settled = running & solvable & ((size < config.step_tolerance) | has_settled | exhausted)
-    p.ended = torch.where(settled, Status.converged.code, p.ended)
+    p.ended = p.ended.masked_fill(settled, Status.converged.code)
     # A group does not wait for those who cannot go along.
     left = running & ~takeable & share.any(takeable)
     hopeless = left | running & at_limit if config.initial_damping > 0 else running
-    p.ended = torch.where(hopeless & ~solvable, Status.singular.code, p.ended)
+    p.ended = p.ended.masked_fill(hopeless & ~solvable, Status.singular.code)
     astray = running if config.accept_every_step else left
-    p.ended = torch.where(astray & solvable & ~finite, Status.non_finite.code, p.ended)
+    p.ended = p.ended.masked_fill(astray & solvable & ~finite, Status.non_finite.code)
     improved = _move(problem, p, candidate, at_candidate, accepted, config)
     return IterationOutcome(running, accepted, improved)
 

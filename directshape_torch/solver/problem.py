@@ -129,7 +129,9 @@ def put_rows(state: StateT, index: Tensor, rows: StateT) -> StateT:
 
 def where_rows(condition: Tensor, a: StateT, b: StateT) -> StateT:
     """Rows of `a` where the condition (B,) holds, else of `b`."""
-    conditions = [condition]
-    for _ in range(max(x.ndim for x in a) - 1):
-        conditions.append(conditions[-1].unsqueeze(-1))
-    return type(a)(*(torch.where(conditions[x.ndim - 1], x, y) for x, y in zip(a, b, strict=True)))
+
+    def chosen(x: Tensor, y: Tensor) -> Tensor:
+        # What there is nothing of is alike.
+        return torch.where(condition.view(-1, *[1] * (x.ndim - 1)), x, y) if x.shape[1:].numel() else x
+
+    return type(a)(*map(chosen, a, b))
