@@ -340,10 +340,6 @@ class CarIterations:
         # No component of the rotation is larger than its limit.
         return retract(state, step, self.stage.problem.config.solver.max_code, math.sqrt(3) * _MAX_STEP_RAD)
 
-    def step_limits(self) -> Tensor:
-        """Largest trusted step of each unknown, (D,)."""
-        return self.stage.step_limits()
-
     def of_problems(self, keep: Tensor, numbers: Sequence[int], at: Evaluation) -> tuple[CarIterations, Evaluation]:
         """Those of the cars where `keep` (B,) holds, `numbers` of them, with their evaluation."""
         index = torch.nonzero_static(keep, size=len(numbers))[:, 0]

@@ -186,7 +186,7 @@ def _run_stage(
     if len(numbers) < len(ended):
         rows = torch.nonzero_static(unfailed.keep, size=len(numbers))[:, 0]
         part, progress = progress.take(part, unfailed.keep, numbers)
-    limits = part.step_limits().to(progress.at_state.gradient)
+    limits = begun.step_limits().to(progress.at_state.gradient)
     failed: set[int] = set()
     done = 0
     while done < stage.max_iterations and numbers:

@@ -54,10 +54,6 @@ class StageProblem(Protocol[StateT]):
         """The state moved by tangent vectors (B, D) within the step limits: the only place where a state changes."""
         ...
 
-    def step_limits(self) -> Tensor:
-        """Largest trusted step of each unknown, (D,)."""
-        ...
-
     def of_problems(self, keep: Tensor, numbers: Sequence[int], at: Any) -> tuple[StageProblem[StateT], Any]:
         """The same without the problems where `keep` (B,) is false, with their evaluation.
 
