@@ -67,6 +67,9 @@ def test_a_car_may_turn_back() -> None:
     torch.testing.assert_close(modulo, torch.zeros(5, dtype=torch.float64))
     torch.testing.assert_close(path[:, 7], turning[7].expand(5))
     assert hold_of_path(CONFIG, sharing, cars, state).tolist() == [1.0] * 5
+    # With its acceleration the path itself is where the car is.
+    place, _ = motion_terms(CONFIG, cars)
+    assert place.residual_of(cars, state._replace(path=turning.expand(5, 9))).residual.abs().max() < 1e-9
 
 
 @pytest.mark.parametrize("backwards", [False, True])
