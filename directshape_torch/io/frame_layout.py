@@ -32,8 +32,6 @@ class FrameFiles:
     # "0005_000012".
     names: tuple[str, ...]
     plane: Path  # where it would be
-    # The sequence of frames that follow each other, "" where there is but one; None: a frame by itself.
-    sequence: str | None = None
     labels: Path | None = None
     velo_to_cam: Path | None = None  # places the LiDAR; None: the calibration does
     # Times and camera poses of a sequence, a line each from frame 0 on.
@@ -107,6 +105,12 @@ class FrameLayout(Protocol):
     def files(self, frame_id: str) -> FrameFiles:
         """The files of a frame."""
 
+    def sequence_of(self, frame_id: str) -> str | None:
+        """The sequence of frames that follow each other, "" where there is but one; None: a frame by itself.
+
+        Asked of every frame of a data set, so without a look at the disk.
+        """
+
 
 def candidates(folder: Path, names: Sequence[str], endings: Sequence[str]) -> list[Path]:
     """Where the file of a frame of several names may be."""
@@ -125,12 +129,14 @@ def frames_among(known: Sequence[str], wanted: Iterable[str | int], expected: st
     A number may leave out what all of them end in: 7 is `000007_10`, the first pair of a scene of KITTI Stereo 2015.
 
     Raises:
-        InputError: unknown ones; in the words for what was expected.
+        InputError: unknown ones, in the words for what was expected; or one alone, for a word is also its letters.
 
     Examples:
         >>> frames_among(["000007", "000012"], [12, "7"], "frames of a run")
         ['000012', '000007']
     """
+    if isinstance(wanted, (str, int)):
+        raise InputError("frames", "a list of ids or numbers", repr(wanted), f"give [{wanted!r}]")
     of_number = {_number(name.removesuffix("_10")): name for name in reversed(known)}
     # The ids after the numbers, so that they win.
     found = of_number | {name: name for name in known}

@@ -131,13 +131,17 @@ class Layout:
             calibration=path(patterns.calibration),
             detections=first_existing([*found, self.detections_dir / f"{names[0]}{self._ending}"]),
             names=tuple(dict.fromkeys(names)),
-            sequence=None if not patterns.follow_each_other else "" if self._single else name,
             plane=first_existing([path(patterns.plane), path(patterns.plane, without_end)]),
             labels=known(patterns.labels),
             velo_to_cam=path(patterns.velo_to_cam) if patterns.velo_to_cam else None,
             times=known(patterns.times),
             trajectory=known(patterns.trajectory),
         )
+
+    def sequence_of(self, frame_id: str) -> str | None:
+        name, _ = self._split(frame_id)
+        follow_each_other = self._sequences[name][1].follow_each_other
+        return None if not follow_each_other else "" if self._single else name
 
     def _split(self, frame_id: str) -> tuple[str, str]:
         """Names of a frame's sequence, and of the frame in it."""

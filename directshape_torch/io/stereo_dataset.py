@@ -134,7 +134,7 @@ def open_dataset(
         raise InputError("ground", f"one of {', '.join(get_args(GroundSource))}", repr(ground))
     frame_ids = _chosen_frames(layout, split, frames)
     first = layout.files(frame_ids[0])
-    if tracks and first.sequence is None:
+    if tracks and layout.sequence_of(frame_ids[0]) is None:
         raise InputError("tracks", "a layout of sequences: tracking, raw or folder", "frames by themselves")
     if isinstance(masks, (str, Path)):
         masks = LayoutMasks(layout, existing_folder(Path(masks), "is not a folder of masks"))
@@ -232,7 +232,7 @@ class StereoDataset:
 
     def sequence_of(self, frame_id: str) -> str | None:
         """The sequence through which the tracks of a frame go, "" where there is but one; None: it has no tracks."""
-        return self.layout.files(frame_id).sequence if self.tracks else None
+        return self.layout.sequence_of(frame_id) if self.tracks else None
 
     def input_files(self, frame_id: str) -> dict[str, Path]:
         """The files that `load` reads for a frame and that bear on its result, by their role."""
@@ -267,7 +267,7 @@ class StereoDataset:
         """Of all frames of a sequence, whichever of them are used: those of its files, or associated."""
         objects: dict[str, list[KittiObject]] = {}
         for frame_id in self.layout.frame_ids():
-            if self.layout.files(frame_id).sequence == sequence:
+            if self.layout.sequence_of(frame_id) == sequence:
                 # A file that cannot be read is reported when its turn comes.
                 with contextlib.suppress(DirectShapeError, OSError):
                     objects[frame_id] = self.objects(frame_id)

@@ -176,7 +176,7 @@ def open_sequence(root: Path, frames: Sequence[int | str] | None = None) -> dict
     chosen = known if frames is None else frames_among(known, frames, "ids of images")
     # Numbers with and without leading zeros.
     found = {frame_id: layout.files(frame_id) for frame_id in sorted(chosen, key=lambda name: (len(name), name))}
-    if len({files.sequence for files in found.values()}) > 1 or len(found) < 2:
+    if len({layout.sequence_of(frame_id) for frame_id in found}) > 1 or len(found) < 2:
         cure = "give the folder of one sequence, and more frames"
         raise InputError("frames", "at least two consecutive frames of one sequence", str(len(found)), cure)
     # Now rather than after minutes of work on the frames before it.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -116,6 +117,9 @@ def test_tracking_frames_called_by_sequence_in_one_folder(kitti: Path, tmp_path:
     detections, masks = renamed(kitti, tmp_path, (f"{SEQUENCE}_000000", f"{SEQUENCE}_000001"))
     dataset = open_dataset("tracking", tmp_path, detections, masks, dtype=torch.float64)
     assert_same(dataset, f"{SEQUENCE}_000001", expected)
+    # Which frames belong together is asked of every frame of a data set, by every process of a run.
+    shutil.rmtree(tmp_path / "training")
+    assert replace(dataset, tracks=True).sequence_of(f"{SEQUENCE}_000001") == SEQUENCE
 
 
 def test_stereo2015(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
@@ -172,3 +176,6 @@ def test_wrong_words_and_folders_that_are_not_there(kitti: Path, tmp_path: Path)
     for layout, root, given, message in cases:
         with pytest.raises((InputError, DataFormatError), match=message):
             open_dataset(layout, root, given)  # type: ignore[arg-type]
+    # Not the frames 0, 0, 0, 0, 0 and 1.
+    with pytest.raises(InputError, match=r"frames: expected a list of ids or numbers, got '000001'"):
+        open_dataset("kitti", kitti, detections, frames="000001")
