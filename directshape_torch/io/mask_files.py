@@ -21,6 +21,7 @@ from directshape_torch.io.instance_masks import (
     Side,
     check_count,
     check_size,
+    decode_segmentation,
     file_of_frame,
     instance_of,
     read_mask,
@@ -213,8 +214,13 @@ def _from_coco(
         side = of_side or entry.get("image")
         if side not in SIDES:
             raise DataFormatError(path, f"entry {index}: 'image' is {shown(side)}, expected 'left' or 'right'")
-        mask = entry.get("soft_probability") or entry.get("segmentation")
-        probability = read_mask(path, f"entry {index}", mask, size_hw, path.parent)
+        soft, where = entry.get("soft_probability"), f"entry {index}"
+        # Run lengths alone, without their size, are text too, and no path.
+        probability = (
+            read_mask(path, where, str(soft), size_hw, path.parent)
+            if soft
+            else decode_segmentation(path, where, entry.get("segmentation"), size_hw)
+        )
         if tight_box(probability) is None:  # whatever else its entry says
             continue
         try:
