@@ -71,21 +71,6 @@ class Record:
         """The rows `index` (M,) int64, in that order."""
         return self._with(lambda value: value.index_select(0, index.to(value.device)), by_row=True)
 
-    @classmethod
-    def joined(cls, records: Sequence[Self]) -> Self:
-        """The rows of several records one after the other; other values than tensors and tuples are the first's."""
-        values: dict[str, Any] = {}
-        for each in fields(cls):  # type: ignore[arg-type]
-            first, *rest = (getattr(record, each.name) for record in records)
-            if isinstance(first, Record):
-                first = type(first).joined([first, *rest])
-            elif isinstance(first, Tensor):
-                first = torch.cat([first, *rest])
-            elif isinstance(first, tuple):
-                first = tuple(item for part in (first, *rest) for item in part)
-            values[each.name] = first
-        return cls(**values)
-
     def _with(self, change: Callable[..., Tensor], *others: Self, by_row: bool = False) -> Self:
         """A copy with all tensors changed, each with its counterparts; `by_row`, but what is shared."""
         changed: dict[str, Any] = {}
@@ -140,6 +125,21 @@ class TensorRecord(Record):
                 yield from value.tensors(f"{name}.{each.name}")
             elif each.name in declared and value is not None:
                 yield DeclaredTensor(f"{name}.{each.name}", value, declared[each.name][0].kind)
+
+    @classmethod
+    def joined(cls, records: Sequence[Self]) -> Self:
+        """The rows of several records one after the other; other values than tensors and tuples are the first's."""
+        values: dict[str, Any] = {}
+        for each in fields(cls):  # type: ignore[arg-type]
+            first, *rest = (getattr(record, each.name) for record in records)
+            if isinstance(first, TensorRecord):
+                first = type(first).joined([first, *rest])
+            elif isinstance(first, Tensor):
+                first = torch.cat([first, *rest])
+            elif isinstance(first, tuple):
+                first = tuple(item for part in (first, *rest) for item in part)
+            values[each.name] = first
+        return cls(**values)
 
 
 class CarRecord(Record):

@@ -124,7 +124,10 @@ def test_empty_mask_is_no_instance(tmp_path: Path) -> None:
         ({}, r"000000\.json: is not a list of COCO results"),
         ([entry(image="middle")], "entry 0: 'image' is 'middle', expected 'left' or 'right'"),
         ([{"image": "left", "segmentation": {"size": [6, 9], "counts": RUNS}}], "entry 0: bad or missing field .*cat"),
-        ([entry(image="left", segmentation=encoded(MASK))], r"000000\.json: entry 0: 'segmentation' is neither RLE nor"),
+        (
+            [entry(image="left", segmentation=encoded(MASK))],
+            r"000000\.json: entry 0: 'segmentation' is neither RLE nor",
+        ),
         ([entry(image="left", bbox=[1, 2])], "entry 0: bad or missing field"),
         (
             [entry(image="left", segmentation={"size": [9, 6], "counts": RUNS})],
