@@ -121,7 +121,13 @@ class PCAShapePrior(nn.Module):
         return DimensionsDerivative(hwl, self.dimensions_basis_hwl.expand(len(code), -1, -1))
 
     def save(self, path: Path | str, grid_dtype: torch.dtype = torch.float32) -> None:
-        """Write a safetensors file, atomically; grids in `torch.float16` halve it and round by less than 1 mm."""
+        """Write a safetensors file, atomically; grids in `torch.float16` halve it and round by less than 1 mm.
+
+        Raises:
+            InputError: another `grid_dtype` than these two.
+        """
+        if grid_dtype not in (torch.float16, torch.float32):
+            raise InputError("grid_dtype", "torch.float16 or torch.float32", repr(grid_dtype))
         tensors = {name: tensor.to(torch.float32) for name, tensor in self.named_buffers()}
         tensors |= {name: tensors[name].to(grid_dtype) for name in ("mean", "basis")}
         write_prior(path, self.SCHEMA, self.provenance, tensors, spacing_m=self.spacing_m)

@@ -98,6 +98,13 @@ def test_file_round_trip(prior, tmp_path, grid_dtype, atol):
     torch.testing.assert_close(read.dimensions_basis_hwl.double(), prior.dimensions_basis_hwl, atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize("grid_dtype", [torch.int32, torch.bfloat16, "float16"])
+def test_no_file_is_written_that_holds_no_grids(prior, tmp_path, grid_dtype):
+    with pytest.raises(InputError, match=r"grid_dtype: expected torch\.float16 or torch\.float32"):
+        prior.save(tmp_path / "prior.safetensors", grid_dtype)
+    assert not any(tmp_path.iterdir())
+
+
 def test_fit_refuses_samples_that_make_no_prior(samples):
     with pytest.raises(InputError, match="more than num_codes = 4"):
         fit_pca(samples[:4], ORIGIN, SPACING_M, 4, MADE)

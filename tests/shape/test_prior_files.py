@@ -68,7 +68,7 @@ def test_wrong_files_say_what_is_wrong(kind: str, tmp_path: Path) -> None:
     content = good.read_bytes()
     for damaged in (content[:5], content[:200], content[:-4], b"", b"no tensors at all" * 100):
         bad.write_bytes(damaged)
-        with pytest.raises(DataFormatError, match=r"bad\.safetensors: not a whole safetensors file"):
+        with pytest.raises(DataFormatError, match=r"bad\.safetensors: not a whole safetensors file .*make one with"):
             load_prior(bad)
     tensors, description = load_file(good), json.loads(_metadata(good)["description"])
     name = sorted(tensors)[0]
