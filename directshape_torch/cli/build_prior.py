@@ -54,6 +54,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--spacing", "0.02 to 0.5 m", f"{args.spacing}")
     if args.num_codes < 1:
         raise InputError("--num-codes", "at least 1", f"{args.num_codes}")
+    if args.out.suffix == ".json":
+        raise InputError("--out", "another ending than .json, which is that of the report", str(args.out))
     options = MeshOptions(
         args.forward_axis,
         args.up_axis,

@@ -53,6 +53,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Estimate, write file and picture, report; 0, or 1 where there is no evidence."""
+    if args.out.suffix == ".png":
+        raise InputError("--out", "another ending than .png, which is that of the picture", str(args.out))
     rigs = [] if args.rig == "none" else load_rigs(args.rig)
     for source in dict.fromkeys(args.sources):
         if source == "detections":

@@ -48,6 +48,8 @@ CASES = [
     (f"{PRIOR} --pattern *.glb", "none in"),
     (f"{PRIOR} --num-codes 9 --up-axis=-y --spacing 0.2", "more than --num-codes = 9 usable meshes"),
     (f"{PRIOR} --spacing 3", "--spacing"),
+    (PRIOR.replace("car.safetensors", "car.json"), "--out: expected another ending than .json, which is that of the"),
+    ("calibrate-rig --data {root} --out {out}/rig.png", "--out: expected another ending than .png"),
     (REFINE, "--masks: expected either a folder"),
     (f"{MASKED} --masks-left x.json", "got both"),
     (REFINE.replace("--out {out}", "--out {root}/detections --masks {root}/masks"), "it would overwrite its own input"),
