@@ -90,7 +90,7 @@ def _earlier_record(path: Path, run: str, inputs: Mapping[str, str]) -> FrameRec
 
 
 def write_meshes(
-    out_dir: Path, frame_id: str, lines: Sequence[KittiObject], result: RefinementResult, mesh_format: MeshFormat
+    out_dir: Path | str, frame_id: str, lines: Sequence[KittiObject], result: RefinementResult, mesh_format: MeshFormat
 ) -> list[Path]:
     """The surface of each refined car of a frame in the left camera frame, metres; returns the files.
 

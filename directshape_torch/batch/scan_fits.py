@@ -19,7 +19,7 @@ from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.shape.shape_prior import ShapePrior
 
 
-def fit_scan(dataset: StereoDataset, frame_id: str, out_dir: Path, prior: ShapePrior | None = None) -> ShapeFit:
+def fit_scan(dataset: StereoDataset, frame_id: str, out_dir: Path | str, prior: ShapePrior | None = None) -> ShapeFit:
     """Fit a pose and a shape, in the left camera frame, to the points in each box of a frame.
 
     Writes `data/ID.txt` (result lines), `shapes/ID.npz` and `meshes/ID_LINE.ply`, the latter in the camera frame.
@@ -40,9 +40,9 @@ def fit_scan(dataset: StereoDataset, frame_id: str, out_dir: Path, prior: ShapeP
     chosen = [objects[row] for row in rows]
     hwl = torch.tensor([each.hwl for each in chosen], dtype=torch.float64).reshape(-1, 3)
     fit = fit_shape(points, poses_to_boxes(poses_cam(chosen, camera.t_cam_ref[0]), hwl, "kitti"), "kitti", prior)
-    cars = replace(fit.cars, t_cam_ref=camera.t_cam_ref.expand(len(rows), 3))
-    write_result_text(result_path(out_dir, frame_id), objects, refined_boxes(cars.boxes(), cars.refined, rows))
+    fit = replace(fit, cars=replace(fit.cars, t_cam_ref=camera.t_cam_ref.expand(len(rows), 3)))
+    write_result_text(result_path(out_dir, frame_id), objects, refined_boxes(fit.cars.boxes(), fit.cars.refined, rows))
     numbers = np.array([each.line_number for each in chosen], dtype=np.int64)
     write_npz(shapes_path(out_dir, frame_id), fit.arrays("cam", input_lines=numbers))
-    write_meshes(out_dir, frame_id, chosen, cars, "ply")
+    write_meshes(out_dir, frame_id, chosen, fit.cars, "ply")
     return fit
