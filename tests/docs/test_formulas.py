@@ -33,7 +33,8 @@ def test_every_formula_is_drawn(tmp_path: Path) -> None:
         text = (tmp_path / "site" / f"{name}.html").read_text(encoding="utf-8")
         drawn = re.sub(r"<code>.*?</code>|<script.*?</script>", "", text, flags=re.DOTALL)
         assert "$" not in drawn, name
-        assert "merror" not in drawn, name
+        # What the converter does not know it writes as text.
+        assert "\\" not in drawn, name
         assert drawn.count("<math") == formulas_of(page), name
 
 
