@@ -58,7 +58,7 @@ def refine_dataset(
     Raises:
         ResumeError: the folder holds results of another configuration, prior or input.
         RunInProgressError: another run is writing there.
-        InputError: the folder would overwrite the detections, or a folder in it is a link.
+        InputError: `out_dir` is no folder or would overwrite the detections, or a folder in it is a link.
         DirectShapeError: the run cannot go on: the disk is full, workers die before they finish anything.
     """
     out_dir, options = Path(out_dir), options or RefineOptions()
@@ -239,7 +239,9 @@ def package_version() -> str:
 
 
 def check_out_dir(dataset: StereoDataset, out_dir: Path) -> None:
-    """Raise `InputError` where the folder would overwrite the detections, or a folder in it is a link."""
+    """Raise `InputError` where it is no folder or would overwrite the detections, or a folder in it is a link."""
+    if out_dir.exists() and not out_dir.is_dir():
+        raise InputError("out", "a folder, which is made where it is missing", f"the file {out_dir}")
     for link in (out_dir / name for name in OUTPUT_FOLDERS if (out_dir / name).is_symlink()):
         cure = "remove the link; the output folder itself may be one"
         raise InputError("out", "folders of its own in it, where results are written and removed", f"link {link}", cure)

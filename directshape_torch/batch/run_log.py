@@ -166,8 +166,9 @@ class RunLog:
         self._append({**start, "schema_version": LOG_SCHEMA_VERSION, **asdict(beginning)})
 
     def add(self, event: RunEvent) -> None:
-        """Write a later line."""
-        self._append({name: value for name, value in asdict(event).items() if value is not None})
+        """Write a later line: what is known of it."""
+        nothing = asdict(RunEvent(event.at))
+        self._append({k: value for k, value in asdict(event).items() if k == "at" or value != nothing[k]})
 
     def _append(self, content: Mapping[str, Any]) -> None:
         """All of a line or, where that fails, nothing."""

@@ -12,7 +12,7 @@ import argparse
 import json
 from pathlib import Path
 
-from directshape_torch.cli.options import add_data_options, dataset_of
+from directshape_torch.cli.options import add_data_options, add_lidar_option, dataset_of
 from directshape_torch.cli.progress import ProgressBar
 from directshape_torch.data_check.check_dataset import check_dataset, report_content, spread
 from directshape_torch.errors import DataFormatError
@@ -22,7 +22,9 @@ from directshape_torch.scene_check.finding import CheckReport, unreadable
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The data set, and how much of it is read."""
-    add_data_options(parser.add_argument_group("input"))
+    inputs = parser.add_argument_group("input")
+    add_data_options(inputs)
+    add_lidar_option(inputs)
     group = parser.add_argument_group("extent and output")
     group.add_argument(
         "--max-frames",

@@ -30,7 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             f"--{name}", type=Path, required=True, metavar="DIR", help=f"{what} (or DIR/data), in the same forms"
         )
     add_frame_choice(parser, "all of --before")
-    parser.add_argument("--shapes", type=Path, metavar="DIR", help="OUT/shapes: count only cars that had a mask")
+    parser.add_argument("--shapes", type=Path, metavar="DIR", help="OUT/shapes, or OUT: count only cars with a mask")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all groups")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write one line for each detection")
     add_interval_options(parser)

@@ -86,6 +86,12 @@ def add_mask_options(group: argparse._ActionsContainer) -> None:
     group.add_argument("--masks-right", type=Path, metavar="FILE", help="COCO results of the right images")
 
 
+def add_lidar_option(group: argparse._ActionsContainer) -> None:
+    """`--lidar`."""
+    words = "LiDAR scans NNNNNN.bin (KITTI's velodyne) as further evidence"
+    group.add_argument("--lidar", type=Path, metavar="DIR", help=words)
+
+
 def add_config_option(group: argparse._ActionsContainer) -> None:
     """`--config`, which stays text: ./paper is a file and paper the bundled settings."""
     group.add_argument(

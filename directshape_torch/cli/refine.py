@@ -20,6 +20,7 @@ from directshape_torch.batch.run_summary import format_summary
 from directshape_torch.cli.options import (
     add_data_options,
     add_device_option,
+    add_lidar_option,
     add_refiner_options,
     dataset_of,
     make_refiner,
@@ -48,9 +49,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     inputs = parser.add_argument_group("input")
     add_data_options(inputs)
     inputs.set_defaults(rig="auto")
-    inputs.add_argument(
-        "--lidar", type=Path, metavar="DIR", help="LiDAR scans NNNNNN.bin (KITTI's velodyne) as further evidence"
-    )
+    add_lidar_option(inputs)
     inputs.add_argument(
         "--tracks",
         action="store_true",

@@ -100,8 +100,8 @@ def compare_results(
         split: file with one frame id a line; default every frame of `before_dir`; where that is of the tracking
             benchmark, those of `after_dir`.
         frames: ids of the frames to compare, instead of `split`.
-        shapes_dir: `OUT/shapes` of the refinement: leaves out detections that had no left mask, and lines that were
-            only copied; they still take their labels.
+        shapes_dir: `OUT/shapes` of the refinement, or `OUT`: leaves out detections that had no left mask, and lines
+            that were only copied; they still take their labels.
         num_draws, seed: of the confidence intervals.
 
     Raises:
@@ -114,6 +114,8 @@ def compare_results(
     if not frame_ids:
         raise InputError("frames", f"at least one frame; result files NNNNNN.txt in {before_dir}", "none")
     cars: list[ComparedCar] = []
+    if shapes_dir is not None and (below := Path(shapes_dir) / "shapes").is_dir():
+        shapes_dir = below
     num_counted = num_left_out = 0
     for frame_id in frame_ids:
         found, count = _cars_of_frame(sources, frame_id)

@@ -80,7 +80,7 @@ def evaluate_kitti(
 
     Raises:
         DataFormatError: a folder, a label file of the split or a line is missing or damaged, or a result has no score.
-        InputError: no frame has labels, or none has results.
+        InputError: no frame has labels, or none has results, or the class occurs in neither.
     """
     labels, results = _files(labels_dir, "labels"), _files(results_dir, "results")
     named = named_frames(frames, split)
@@ -96,6 +96,9 @@ def evaluate_kitti(
         (read_objects(labels[frame_id]), _results(results[frame_id]) if frame_id in results else [])
         for frame_id in frame_ids
     ]
+    occurring = sorted({each.type for pair in pairs for objects in pair for each in objects})
+    if object_type.lower() not in map(str.lower, occurring):
+        raise InputError("object_type", f"a class of these files: {', '.join(occurring) or 'none'}", object_type)
     return replace(
         score_frames(pairs, object_type),
         num_frames_without_results=len(frame_ids) - len(with_results),

@@ -45,7 +45,8 @@ def load_prior(source: Path | str) -> ShapePrior:
     if bundled is not None:
         return bundled()
     path = Path(source)
-    schema = read_description(path, "make one with: directshape build-prior").get("schema", "none")
+    cure = f"make one with: directshape build-prior; bundled ones are {' and '.join(BUNDLED_PRIORS)}"
+    schema = read_description(path, cure).get("schema", "none")
     reader = _READERS.get(schema) if isinstance(schema, str) else None
     if reader is None:
         raise DataFormatError(path, f"schema {shown(schema)} is none of {', '.join(_READERS)}")

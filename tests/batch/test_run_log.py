@@ -56,6 +56,7 @@ def written(out: Path) -> bytes:
         for frame_id, failure in (("000000", None), ("000001", "cut short"), ("000002", None)):
             log.add(RunEvent(2.0, frame=frame_id, failure=failure))
         log.add(RunEvent(3.0, end="finished", done=4, failed={"000001": "cut short"}))
+    assert b'{"at": 2.0, "frame": "000000"}\n' in log_path(out).read_bytes()
     return log_path(out).read_bytes()
 
 

@@ -53,6 +53,11 @@ CASES = [
     (REFINE, "--masks: expected either a folder"),
     (f"{MASKED} --masks-left x.json", "got both"),
     (REFINE.replace("--out {out}", "--out {root}/detections --masks {root}/masks"), "it would overwrite its own input"),
+    (
+        MASKED.replace("--out {out}", "--out {root}/prior.safetensors"),
+        "out: expected a folder, which is made where it is missing, got the file",
+    ),
+    (f"{MASKED} --prior pcaa", "directshape build-prior; bundled ones are pca and neural"),
     (f"{MASKED} --threads 0", "threads: expected at least 1, got 0"),
     (f"{MASKED} --lidar nowhere", "nowhere: is no folder of LiDAR scans"),
     (f"{MASKED} --disparity x", "--disparity: expected a method that uses it, got direct; add --method"),
@@ -62,6 +67,10 @@ CASES = [
         "such as 000000, got 77",
     ),
     ("evaluate --labels {root}/training/label_2 --results {root}/training/label_2", "a result without score"),
+    (
+        f"evaluate --type Truc --labels {DEMO_FOLDER}/training/label_2 --results {DEMO_FOLDER}/detections/noisy_stereo",
+        "a class of these files: Car, got Truc",
+    ),
 ]
 
 

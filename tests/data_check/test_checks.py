@@ -187,6 +187,9 @@ def test_command(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert main([*command(kitti), "--data", str(tmp_path / "nowhere"), "--json", "-"]) == 1
     (finding,) = json.loads(capsys.readouterr().out)["findings"]
     assert finding["check"] == "layout"
+    (tmp_path / "scans").mkdir()
+    assert main(command(kitti, "--lidar", str(tmp_path / "scans"))) == 1
+    assert f"no lidar: {tmp_path / 'scans' / '000000.bin'}" in " ".join(capsys.readouterr().out.split())
     with pytest.raises(InputError, match="max_frames: expected at least 1"):
         check_dataset(open_dataset("kitti", kitti, kitti / "detections"), 0)
 

@@ -119,6 +119,7 @@ def test_cars_without_a_mask_are_left_out(folders: tuple[Path, Path, Path], tmp_
     assert [(c.frame_id, c.detection_line) for c in comparison.cars] == [("000001", 1), ("000002", 2)]
     assert comparison.num_filtered_out == 1
     assert "1 more detections have no left mask" in format_comparison(comparison)
+    assert compare_results(*folders, shapes_dir=tmp_path) == comparison
 
 
 def test_frames_and_split_choose(folders: tuple[Path, Path, Path], tmp_path: Path):
