@@ -52,3 +52,10 @@ def test_skips_a_mesh_that_is_no_solid_and_says_so(meshes, tmp_path, capsys):
     (folder / "broken.obj").write_text("v 0 0 0\n")
     assert run("--meshes", str(folder), "--out", str(tmp_path / "car.safetensors"), *OPTIONS) == 3
     assert "skipped broken.obj" in capsys.readouterr().out
+
+
+def test_two_cars_say_nothing_of_a_third(meshes, tmp_path, capsys):
+    out = tmp_path / "car.safetensors"
+    assert run("--meshes", str(meshes), "--out", str(out), "--pattern", "car[01].*", *OPTIONS) == 0
+    assert json.loads(out.with_suffix(".json").read_text())["leave_one_out_error_cm"] is None
+    assert "leave-one-out error within 7 cm of the surface: not known, of two cars" in capsys.readouterr().out
