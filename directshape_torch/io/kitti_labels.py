@@ -133,7 +133,10 @@ def objects_path(source: Path, frame_id: str) -> Path:
 
 def objects_in(path: Path, *names: str) -> list[KittiObject]:
     """The objects of a frame in a file that is called as the frame, else in one of the tracking benchmark."""
-    return read_objects(path) if path.stem in names else read_tracking_objects(path).get(frame_number(names[0]), [])
+    if path.stem in names:
+        return read_objects(path)
+    # A list of the caller's own, for that of the file is remembered.
+    return [*read_tracking_objects(path).get(frame_number(names[0]), [])]
 
 
 def frame_number(frame_id: str) -> int:
