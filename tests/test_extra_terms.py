@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from typing import Any, Self
 
 import pytest
 import torch
@@ -29,7 +29,7 @@ from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.point_cloud import PointCloud
 from directshape_torch.terms.priors import PriorResidual, PriorTerm, height_prior
 from directshape_torch.terms.robust import RobustValue, quadratic
-from directshape_torch.terms.term import Linear, Term, Where
+from directshape_torch.terms.term import Linear, Sight, Term, Where
 
 
 def lower_by(metres: Tensor | float) -> Callable[[CarBatch, CarState], PriorResidual]:
@@ -247,7 +247,7 @@ class LowerTerm(Term):
         return self.block_weight
 
     @classmethod
-    def of(cls, name: str, cars: CarBatch) -> LowerTerm:
+    def of(cls, name: str, cars: CarBatch) -> Self:
         weight = torch.full((len(cars),), 1e5, dtype=torch.float64)
         blocks = Blocks.one_each(len(cars), weight.device)
         return cls((name,), cars, blocks, weight, torch.zeros_like(blocks.owner), torch.ones(len(cars), 1, 1).double())
@@ -262,8 +262,8 @@ class LowerTerm(Term):
     def norm(self, residual: Tensor) -> RobustValue:
         return quadratic(residual)
 
-    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> LowerTerm:
-        return LowerTerm.of(self.names[0], self.cars.of_cars(keep, numbers))
+    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Self:
+        return self.of(self.names[0], self.cars.of_cars(keep, numbers))
 
 
 def test_members_may_be_fields_of_a_dataclass() -> None:
@@ -273,6 +273,18 @@ def test_members_may_be_fields_of_a_dataclass() -> None:
     by_properties = refine(lambda *scene: PriorTerm("user", 1e5, scene[2], lower_by(0.1), 1, is_prior=False))
     torch.testing.assert_close(by_fields.T_cam_obj, by_properties.T_cam_obj, rtol=0, atol=0)
     torch.testing.assert_close(by_fields.covariance, by_properties.covariance, rtol=0, atol=0)
+
+
+class TensorTerm(LowerTerm):
+    """Looks at rows of one tensor, without a tuple around it."""
+
+    def where(self, sight: Sight) -> Where:
+        return torch.ones(len(self.blocks.owner), 1)
+
+
+def test_one_tensor_says_where_rows_look() -> None:
+    nowhere, looking = (refine(lambda *scene, kind=kind: kind.of("user", scene[2])) for kind in (LowerTerm, TensorTerm))
+    torch.testing.assert_close(looking.T_cam_obj, nowhere.T_cam_obj, rtol=0, atol=0)
 
 
 def test_two_terms_of_one_name_are_named() -> None:

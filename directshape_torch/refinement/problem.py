@@ -328,7 +328,7 @@ class CarIterations:
         cost, gradient, hessian = (torch.where(*x) for x in zip(conditions, new[:3], old[:3], strict=True))
 
         def chosen(term: Term, new: Where, old: Where) -> Where:
-            if not new:  # looks nowhere
+            if isinstance(new, tuple) and not new:  # looks nowhere
                 return new
             in_blocks = accepted[term.blocks.owner][:, None]
             return map_tensors(lambda x, y: torch.where(in_blocks, x, y), new, old)
@@ -345,7 +345,9 @@ class CarIterations:
         index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
 
         def kept(term: Term, where: Where) -> Where:
-            blocks = term.blocks.of_cars(keep, numbers)[1] if where else None
+            if isinstance(where, tuple) and not where:
+                return where
+            blocks = term.blocks.of_cars(keep, numbers)[1]
             return map_tensors(lambda x: x.index_select(-2, blocks), where)
 
         rest, factors = (None if x is None else x.index_select(0, index) for x in (self.rest, self.factors))

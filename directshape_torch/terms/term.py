@@ -24,7 +24,7 @@ from directshape_torch.terms.depth import Closest, Hits
 from directshape_torch.terms.robust import RobustValue
 
 Where: TypeAlias = Any
-"""Where the rows of a term look: a named tuple of tensors (..., M, R), constants; empty where they look nowhere."""
+"""Where the rows of a term look: a tensor (..., M, R) or a named tuple of such, constants; `()` for nowhere."""
 
 
 class Sight(NamedTuple):
