@@ -44,6 +44,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for the results (default: %(default)s)",
     )
+    parser.add_argument("--fresh", action="store_true", help="remove the results that runs have left in DIR")
     add_config_option(parser)
     add_device_option(parser)
 
@@ -54,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     refiner = make_refiner(args.config, [], "pca", args.device)
     # Where others share the cores, several threads wait for each other: minutes instead of seconds for one frame.
     with ProgressBar() as progress, limited_threads(1):
-        summary = refine_dataset(dataset, refiner, args.out, RefineOptions(overlays=True), progress)
+        summary = refine_dataset(dataset, refiner, args.out, RefineOptions(overlays=True), progress, fresh=args.fresh)
         (frame_id,) = dataset.frame_ids
         loaded, result = dataset.load(frame_id), RunFolder(args.out).read(frame_id)
         write_bytes(args.out / "scene.glb", frame_glb(PaintedFrame(result, refiner.prior, loaded), loaded))
