@@ -105,7 +105,11 @@ TARGETS: dict[str, Target] = {
     "ray_minimum": Target(
         "directshape_torch/shape/sdf_grid.py",
         ("GridField.minimum_along", "GridField.curvature_along", "_cells_along", "_derivatives_along", "_first_root"),
-        (f"{_LABORATORY}::test_rays_are_closest_where_they_are_said_to_be", *_GRADIENTS),
+        (
+            f"{_LABORATORY}::test_rays_are_closest_where_they_are_said_to_be",
+            "tests/shape/test_ray_minimum.py",
+            *_GRADIENTS,
+        ),
     ),
     "sums": Target("directshape_torch/rows.py", ("CarSums.of", "CarSums.sum"), _SUMS),
     "term_sums": Target(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.kitti_folder import input_options
 
 from directshape_torch.cli.main import main
 from directshape_torch.cli.options import find_device
@@ -16,19 +17,7 @@ QUICK = ("--set", "stages=[{max_iterations: 2}]")
 
 
 def command(root: Path, out: Path, *extra: str, masks: bool = True) -> list[str]:
-    words = [
-        "refine",
-        "--data",
-        root,
-        "--detections",
-        root / "detections",
-        "--out",
-        out,
-        "--prior",
-        root / "prior.safetensors",
-    ]
-    words += ["--masks", root / "masks"] if masks else []
-    return [*map(str, words), "--device", "cpu", *QUICK, *extra]
+    return ["refine", *input_options(root, masks), "--out", str(out), *QUICK, *extra]
 
 
 def test_reports_cars_statuses_time_and_memory(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

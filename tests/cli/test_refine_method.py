@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers.disparity_maps import write_disparity
 from helpers.exact_disparity import exact_disparity
-from helpers.kitti_folder import CODE, write_data_set
+from helpers.kitti_folder import CODE, input_options, write_data_set
 from helpers.synthetic_scene import TWO_CARS, street
 
 from directshape_torch.cli.main import main
@@ -36,19 +36,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def refine(root: Path, out: Path, *extra: str) -> int:
-    words = [
-        "refine",
-        "--data",
-        root,
-        "--detections",
-        root / "detections",
-        "--out",
-        out,
-        "--prior",
-        root / "prior.safetensors",
-    ]
-    words += ["--masks", root / "masks", "--device", "cpu", *QUICK, *extra]
-    return main([str(word) for word in words])
+    return main(["refine", *input_options(root), "--out", str(out), *QUICK, *extra])
 
 
 @pytest.mark.parametrize("method", ["geometric", "combined"])

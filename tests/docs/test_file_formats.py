@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.ellipsoids import ellipsoid_prior
-from helpers.kitti_folder import write_data_set
+from helpers.kitti_folder import input_options, write_data_set
 from safetensors.torch import load_file
 
 from directshape_torch.cli.main import main
@@ -42,9 +42,8 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root, out = (tmp_path_factory.mktemp(name) for name in ("kitti", "out"))
     write_data_set(root, ("000000", "000001"))
     (root / "training" / "image_2" / "000001.png").write_bytes(b"no image")
-    words = ["refine", "--data", root, "--detections", root / "detections", "--masks", root / "masks", "--out", out]
-    options = ["--prior", root / "prior.safetensors", "--device", "cpu", "--set", "stages=[{max_iterations: 1}]"]
-    assert main([str(word) for word in (*words, *options)]) == 1
+    settings = ["--set", "stages=[{max_iterations: 1}]"]
+    assert main(["refine", *input_options(root), "--out", str(out), *settings]) == 1
     return out
 
 

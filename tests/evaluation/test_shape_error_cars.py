@@ -16,7 +16,7 @@ import pytest
 import torch
 from helpers.disparity_maps import write_disparity
 from helpers.exact_disparity import exact_disparity
-from helpers.kitti_folder import CODE, write_data_set
+from helpers.kitti_folder import CODE, input_options, write_data_set
 from helpers.synthetic_scene import TWO_CARS, street
 
 from directshape_torch.cli.main import main
@@ -61,9 +61,8 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("kitti")
     prior = write_data_set(root, FRAMES)
     write_truth(root, prior)
-    words = ["refine", "--data", root, "--detections", root / "detections", "--masks", root / "masks"]
-    words += ["--out", root / "refined", "--prior", root / "prior.safetensors", "--device", "cpu", "--rig", "none"]
-    assert main([*map(str, words), "--set", "stages=[{max_iterations: 1}]"]) == 0
+    options = ["--out", str(root / "refined"), "--rig", "none", "--set", "stages=[{max_iterations: 1}]"]
+    assert main(["refine", *input_options(root), *options]) == 0
     write_perfect(root / "refined", root / "perfect")
     return root
 

@@ -31,6 +31,12 @@ def write_data_set(root: Path, frame_ids: tuple[str, ...] = FRAMES) -> PCAShapeP
     return prior
 
 
+def input_options(root: Path, masks: bool = True) -> list[str]:
+    """What `directshape refine` takes from such a data set, on the CPU."""
+    words = ["--data", root, "--detections", root / "detections", "--prior", root / "prior.safetensors"]
+    return [*map(str, words + (["--masks", root / "masks"] if masks else [])), "--device", "cpu"]
+
+
 def write_frame(root: Path, frame_id: str, scene: Street, detections: Detections) -> None:
     """Everything of one frame under `root/training`, `root/masks` and `root/detections`."""
     training, frames = root / "training", scene.frames
