@@ -261,6 +261,18 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
         )
         for text in ("self.num_nodes - 1", "self.num_nodes - 1 - self.steps_to_last_corner")
     ),
+    *(
+        Equivalent("GridField.minimum_along", text, None, "of a ray beyond the border nothing is used")
+        for text in ("len(self.values) - 1", "len(self.values) - 1 - self.steps_to_last_corner")
+    ),
+    *(
+        Equivalent(function, text, f"(-({text}))", "residual and Jacobian change sign together")
+        for function, text in (
+            ("path_prior", "1 / deviation_sigma(config, cars.time_s)"),
+            ("acceleration_prior", "1 / state.path.new_tensor(sigma)"),
+        )
+    ),
+    Equivalent("_on_the_ground", "R", "(-R)", f"in J_heading_omega it {_IN_PAIRS}"),
     Equivalent("tilt_prior_normal", "zero", "(-zero)", _OF_ZERO),
     Equivalent("NextView.linear", "others", "(-others)", _OF_ZERO),
     Equivalent("pose_prior", "R_cam_obj", "(-R_cam_obj)", f"in J_heading_omega it {_IN_PAIRS}"),

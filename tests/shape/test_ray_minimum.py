@@ -13,7 +13,7 @@ from torch import Tensor
 from directshape_torch.geometry import se3
 from directshape_torch.rows import ObjectRays, Rays
 from directshape_torch.shape.field import Field, PackedField, field_of
-from directshape_torch.shape.sdf_grid import RayMinimum
+from directshape_torch.shape.sdf_grid import RayMinimum, _AlongRay, _first_root
 from directshape_torch.shape.shape_prior import BoundShape
 from directshape_torch.terms.depth import (
     Bracket,
@@ -137,6 +137,13 @@ def test_a_ray_of_nan_disturbs_no_other(kind: str) -> None:
     others = torch.ones(2, 64, dtype=torch.bool)
     others[0, 3] = False
     assert torch.equal(ends[0].depth[others], ends[1].depth[others])
+
+
+def test_a_slope_that_never_vanishes_has_no_root() -> None:
+    """`-1 + 2 s - 3 s^2` is below 0 everywhere, `-1 + 2 s` vanishes at a half."""
+    never, once = (_AlongRay(*torch.tensor([[-1.0], [1.0], [third]])) for third in (-1.0, 0.0))
+    assert _first_root(never) > 1e6
+    assert _first_root(once) == 0.5
 
 
 def test_no_rays() -> None:
