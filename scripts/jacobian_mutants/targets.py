@@ -262,8 +262,13 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
         for text in ("self.num_nodes - 1", "self.num_nodes - 1 - self.steps_to_last_corner")
     ),
     *(
-        Equivalent("GridField.minimum_along", text, None, "of a ray beyond the border nothing is used")
-        for text in ("len(self.values) - 1", "len(self.values) - 1 - self.steps_to_last_corner")
+        Equivalent("GridField.minimum_along", text, f"({wider})", "of a ray beyond the border nothing is used")
+        for text, wider in (
+            ("len(self.values) - 1", "len(self.values) + 1"),
+            ("len(self.values) - 1", "len(self.values)"),
+            ("len(self.values) - 1 - self.steps_to_last_corner", "len(self.values) - 1 + self.steps_to_last_corner"),
+            ("len(self.values) - 1 - self.steps_to_last_corner", "len(self.values) - 1"),
+        )
     ),
     *(
         Equivalent(function, text, f"(-({text}))", "residual and Jacobian change sign together")
