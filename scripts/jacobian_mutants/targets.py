@@ -277,6 +277,13 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
             ("acceleration_prior", "1 / state.path.new_tensor(sigma)"),
         )
     ),
+    *(
+        Equivalent(function, text, f"(-{wrapped})", "of a face's normal over its product with the ray the sign is gone")
+        for function, text, wrapped in (
+            ("attached_closest_depth", "closest.face_obj", "closest.face_obj"),
+            ("GridField.minimum_along", "1 - goes_on", "(1 - goes_on)"),
+        )
+    ),
     Equivalent("_on_the_ground", "R", "(-R)", f"in J_heading_omega it {_IN_PAIRS}"),
     Equivalent("tilt_prior_normal", "zero", "(-zero)", _OF_ZERO),
     Equivalent("NextView.linear", "others", "(-others)", _OF_ZERO),

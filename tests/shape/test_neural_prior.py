@@ -36,6 +36,21 @@ def test_one_unit_by_hand() -> None:
     assert prior.bind(code).value(point, torch.tensor([0])).item() == pytest.approx(expected, abs=1e-7)
 
 
+def test_dimensions_are_a_quadratic_whose_derivative_is_autograds() -> None:
+    prior = small_prior()
+    mean, linear, quadratic = (
+        getattr(prior, f"dimensions_{part}_hwl").normal_() for part in ("mean", "linear", "quadratic")
+    )
+    code = torch.randn(2, dtype=torch.float64)
+
+    def hwl(code: torch.Tensor) -> torch.Tensor:
+        return mean + linear @ code + torch.stack([code @ matrix @ code for matrix in quadratic])
+
+    at = prior.dimensions_and_derivative(code[None])
+    torch.testing.assert_close(at.hwl[0], hwl(code))
+    torch.testing.assert_close(at.J_hwl_code[0], torch.func.jacrev(hwl)(code))
+
+
 def test_both_halves_of_a_car_are_the_same() -> None:
     shape = NeuralShapePrior.load_bundled().double().bind(torch.ones(1, 8, dtype=torch.float64))
     points = torch.rand(50, 3, dtype=torch.float64) - torch.tensor([0.5, 1.0, 0.5])
