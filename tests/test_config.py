@@ -42,6 +42,11 @@ def test_an_unknown_key_names_the_nearest(mapping: dict[str, Any], nearest: str)
     assert str(error.value).endswith(f"the nearest known one is {nearest}")
 
 
+def test_where_none_is_near_an_unknown_key_names_all_of_its_group() -> None:
+    with pytest.raises(ConfigError, match=r"unknown key solver\.qqq; known are initial_damping, .*, max_code"):
+        config_from_mapping(RefinerConfig, {"solver": {"qqq": 1}})
+
+
 @pytest.mark.parametrize(
     ("mapping", "text"),
     [

@@ -20,6 +20,7 @@ from directshape_torch.batch.run_log import RunBeginning, RunEvent, RunLog, digi
 from directshape_torch.batch.run_summary import RunSummary, RunTimings, find_warnings, write_timings
 from directshape_torch.batch.workers import LocalWorkers, reports_of
 from directshape_torch.errors import DirectShapeError, InputError
+from directshape_torch.files.atomic_files import check_folder
 from directshape_torch.io.config_files import config_to_mapping
 from directshape_torch.io.result_files import read_shapes, write_tracks
 from directshape_torch.io.run_folder import done_frames, overlay_path, result_path, shapes_path
@@ -240,8 +241,7 @@ def package_version() -> str:
 
 def check_out_dir(dataset: StereoDataset, out_dir: Path) -> None:
     """Raise `InputError` where it is no folder or would overwrite the detections, or a folder in it is a link."""
-    if out_dir.exists() and not out_dir.is_dir():
-        raise InputError("out", "a folder, which is made where it is missing", f"the file {out_dir}")
+    check_folder("out", out_dir)
     for link in (out_dir / name for name in OUTPUT_FOLDERS if (out_dir / name).is_symlink()):
         cure = "remove the link; the output folder itself may be one"
         raise InputError("out", "folders of its own in it, where results are written and removed", f"link {link}", cure)

@@ -57,6 +57,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--num-codes", "at least 1", f"{args.num_codes}")
     if args.out.suffix == ".json":
         raise InputError("--out", "another ending than .json, which is that of the report", str(args.out))
+    atomic_files.check_file("--out", args.out)
     options = MeshOptions(
         args.forward_axis,
         args.up_axis,
@@ -74,7 +75,6 @@ def run(args: argparse.Namespace) -> int:
     samples = torch.stack(list(grids.values()))
     provenance = PriorProvenance("directshape build-prior", args.licence, len(grids), ", ".join(grids))
     prior = fit_pca(samples, torch.tensor(grid.origin), grid.spacing_m, args.num_codes, provenance)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
     prior.save(args.out)
     report = _report(prior, samples, tuple(grids), skipped)
     atomic_files.write_json(args.out.with_suffix(".json"), report)

@@ -16,7 +16,7 @@ from pathlib import Path
 from directshape_torch.cli.options import add_data_options, dataset_of
 from directshape_torch.cli.progress import Bar
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.files.atomic_files import write_png
+from directshape_torch.files.atomic_files import check_file, write_png
 from directshape_torch.io.frame_layout import frames_among
 from directshape_torch.io.layouts import object_layout
 from directshape_torch.rig.estimate import RigEstimate, rig_among
@@ -55,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
     """Estimate, write file and picture, report; 0, or 1 where there is no evidence."""
     if args.out.suffix == ".png":
         raise InputError("--out", "another ending than .png, which is that of the picture", str(args.out))
+    check_file("--out", args.out)
     rigs = [] if args.rig == "none" else load_rigs(args.rig)
     for source in dict.fromkeys(args.sources):
         if source == "detections":

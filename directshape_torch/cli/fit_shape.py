@@ -23,7 +23,7 @@ from directshape_torch.batch.scan_fits import fit_scan
 from directshape_torch.cli.options import add_layout_options
 from directshape_torch.errors import InputError
 from directshape_torch.files.array_files import write_npz
-from directshape_torch.files.atomic_files import write_bytes, write_text
+from directshape_torch.files.atomic_files import check_folder, write_bytes, write_text
 from directshape_torch.files.read_files import finite_numbers, read_lines
 from directshape_torch.geometry.box_formats import BoxFormat
 from directshape_torch.io.stereo_dataset import open_dataset
@@ -58,6 +58,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, fit, write, print."""
+    check_folder("out", args.out)
     return _fit_cloud(args) if args.lidar is None else _fit_scans(args)
 
 

@@ -20,7 +20,7 @@ from directshape_torch.cli.options import add_data_options, add_refiner_options,
 from directshape_torch.cli.progress import Bar
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.matching import match_to_labels
-from directshape_torch.files.atomic_files import write_png
+from directshape_torch.files.atomic_files import check_folder, write_png
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.kitti_labels import box_corners_cam
 from directshape_torch.io.result_files import track_name
@@ -60,6 +60,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draw what the options ask for."""
+    check_folder("out", args.out)
     dataset = _dataset(args)
     # One frame is not worth a compilation, and pictures need no graphics card.
     refiner = make_refiner(args.config, ["compile=off", *args.set], args.prior, "cpu")

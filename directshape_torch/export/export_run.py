@@ -12,6 +12,7 @@ from directshape_torch.export.box_files import Coco3dExporter, KittiExporter, Nu
 from directshape_torch.export.frame_source import Exporter, ExportOptions, FrameSource
 from directshape_torch.export.rerun_recording import RerunExporter
 from directshape_torch.export.surface_files import GlbExporter, PlyExporter, PointsExporter
+from directshape_torch.files.atomic_files import check_folder
 from directshape_torch.visualize.run_frames import RunInputs
 
 FORMATS: dict[str, type[Exporter]] = {
@@ -49,6 +50,7 @@ def export_run(
         DataFormatError: a file of the run or of the data set is missing, damaged or not that of the run.
     """
     run, options = inputs.run, ExportOptions() if options is None else options
+    check_folder("out", Path(folder))
     if not run.frame_ids:
         raise InputError("frames", f"finished frames of {run.path}", "none")
     if unknown := [name for name in formats if name not in FORMATS]:

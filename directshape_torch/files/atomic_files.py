@@ -12,6 +12,8 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from directshape_torch.errors import InputError
+
 
 def write_bytes(path: Path | str, content: bytes, durable: bool = False) -> None:
     """Write `content` to `path` by way of a temporary file in the same folder, which is made where it is missing.
@@ -53,6 +55,20 @@ def replaced_file(path: Path | str) -> Iterator[IO[bytes]]:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def check_folder(name: str, path: Path) -> None:
+    """Raise `InputError` where a folder cannot be made, for a file has its name or that of one above it."""
+    existing = next(each for each in (path, *path.parents) if each.exists())
+    if not existing.is_dir():
+        raise InputError(name, "a folder, which is made where it is missing", f"the file {existing}")
+
+
+def check_file(name: str, path: Path) -> None:
+    """Raise `InputError` where a file cannot be written, for its folder cannot be made or a folder has its name."""
+    check_folder(name, path.parent)
+    if path.is_dir():
+        raise InputError(name, "a file", f"the folder {path}")
 
 
 def write_text(path: Path | str, text: str) -> None:

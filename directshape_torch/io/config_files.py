@@ -21,6 +21,8 @@ BUNDLED_CONFIGS = ("default", "paper", "fast")
 # The parser takes a second for ten thousand lines.
 _MOST_BYTES = 2**20
 _CONFIG_FOLDER = Path(__file__).parents[1] / "assets" / "configs"
+# Of two names: a misspelt one has most of its letters.
+_ALIKE = 0.6
 _KINDS = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
 _GroupT = TypeVar("_GroupT", bound=Settings)
 
@@ -34,7 +36,8 @@ def config_from_mapping(cls: type[_GroupT], mapping: Mapping[str, Any], where: s
         where: what stands before the keys in errors, such as "refiner.".
 
     Raises:
-        ConfigError: an unknown key (naming the nearest one), or a value of the wrong kind or out of range.
+        ConfigError: an unknown key (naming the nearest one, or all of its group), or a value of the wrong kind or out
+            of range.
 
     Examples:
         >>> config_from_mapping(RefinerConfig, {"silhouette": {"weight": 6}}).silhouette.weight
@@ -50,8 +53,7 @@ def _from_mapping(cls: type[_GroupT], mapping: Mapping[str, Any], where: str, kn
     hints = cls.types()
     for key in mapping:
         if key not in hints:
-            nearest = _nearest_key(str(key), {f"{where}{name}": name for name in hints}, known)
-            raise ConfigError(f"unknown key {where}{key!s}; the nearest known one is {nearest}")
+            raise ConfigError(f"unknown key {where}{key!s}; {_other_keys(str(key), where, list(hints), known)}")
     values = {key: _convert(hints[key], value, f"{where}{key}", known) for key, value in mapping.items()}
     try:
         return cls(**values)
@@ -59,11 +61,14 @@ def _from_mapping(cls: type[_GroupT], mapping: Mapping[str, Any], where: str, kn
         raise ConfigError(f"{where}{error}") from error
 
 
-def _nearest_key(key: str, here: Mapping[str, str], known: Mapping[str, str]) -> str:
-    """The nearest key of the same group, or one of another group whose own name is nearer still."""
-    names = dict(here) | {path: name for path, name in known.items() if path not in here}
+def _other_keys(key: str, where: str, here: Sequence[str], known: Mapping[str, str]) -> str:
+    """The nearest key of the same group, or one of another group whose own name is nearer still, or else all of the
+    group."""
     # Of equally near ones the first, which is of the same group.
-    return max(names, key=lambda path: difflib.SequenceMatcher(None, names[path], key).ratio())
+    names = {**{f"{where}{name}": name for name in here}, **known}
+    likeness = {path: difflib.SequenceMatcher(None, name, key).ratio() for path, name in names.items()}
+    nearest = max(likeness, key=likeness.__getitem__)
+    return f"the nearest known one is {nearest}" if likeness[nearest] > _ALIKE else f"known are {', '.join(here)}"
 
 
 def _leaves(cls: type[Any]) -> Iterator[str]:

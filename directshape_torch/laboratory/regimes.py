@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -203,11 +202,10 @@ def checked_name(what: str, name: str, known: list[str]) -> str:
     """The name itself if it is known.
 
     Raises:
-        InputError: it is not; lists the names and says which is nearest.
+        InputError: it is not; lists the names.
     """
     if name not in known:
-        nearest = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
-        raise InputError(what, f"one of {', '.join(known)}", repr(name), f"the nearest is {nearest}")
+        raise InputError(what, f"one of {', '.join(known)}", repr(name))
     return name
 
 

@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
+from directshape_torch.files.atomic_files import write_text
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import rotation_y_from_pose, viewing_axes, wrap_angle
 from directshape_torch.numerics.records import CarRecord, Dense
@@ -139,8 +140,7 @@ class TrustModel:
 
     def save(self, path: Path | str) -> None:
         """Write the model as JSON."""
-        text = json.dumps({"schema": SCHEMA, **asdict(self)}, indent=1)
-        Path(path).write_text(text + "\n", encoding="utf-8")
+        write_text(path, json.dumps({"schema": SCHEMA, **asdict(self)}, indent=1) + "\n")
 
 
 def trust_model_of(content: Mapping[str, Any]) -> TrustModel:

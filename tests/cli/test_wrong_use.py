@@ -15,6 +15,7 @@ REPORT = "report {run} --html {out}/page.html"
 INSPECT = "inspect --out {out}"
 PRIOR = "build-prior --meshes {meshes} --out {out}/car.safetensors"
 REFINE = "refine --data {root} --detections {root}/detections --out {out} --prior {root}/prior.safetensors --device cpu"
+FILE = "{root}/prior.safetensors"
 MASKED = f"{REFINE} --masks {{root}}/masks"
 
 CASES = [
@@ -53,10 +54,21 @@ CASES = [
     (REFINE, "--masks: expected either a folder"),
     (f"{MASKED} --masks-left x.json", "got both"),
     (REFINE.replace("--out {out}", "--out {root}/detections --masks {root}/masks"), "it would overwrite its own input"),
-    (
-        MASKED.replace("--out {out}", "--out {root}/prior.safetensors"),
-        "out: expected a folder, which is made where it is missing, got the file",
+    *(
+        (words.replace("{out}", FILE), "expected a folder, which is made where it is missing, got the file")
+        for words in (
+            MASKED,
+            f"{INSPECT} --demo",
+            f"{INSPECT}/figures --demo",
+            f"{EXPORT} --format ply",
+            "fit-shape --points x --boxes x --out {out}",
+            "calibrate-rig --data {root} --out {out}/rig.json",
+            PRIOR,
+            f"report {{run}} --html {FILE}/page.html",
+        )
     ),
+    ("calibrate-rig --data {root} --out {root}", "--out: expected a file, got the folder"),
+    ("report {run} --html {root}", "page: expected a file, got the folder"),
     (f"{MASKED} --prior pcaa", "directshape build-prior; bundled ones are pca and neural"),
     (f"{MASKED} --threads 0", "threads: expected at least 1, got 0"),
     (f"{MASKED} --lidar nowhere", "nowhere: is no folder of LiDAR scans"),
