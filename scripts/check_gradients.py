@@ -1,15 +1,14 @@
 """The Jacobian laboratory: every derivative of the energy three ways, in named regimes, with real image content.
 
-Every term (silhouettes and photometric in both forms, points, all priors) and the factors of the chain have their
-hand-derived Jacobian compared with autograd and with central differences (Richardson extrapolation over a sweep of
-steps); the gradients of the terms have their derivatives by autograd compared with differences. Entries that
-differences cannot judge, as their own estimate of error says, are excluded and counted. A term of one's own,
-`--term module:factory`, is examined as the built-in ones are, and its shapes are checked. Exit code 1 when a bound is
-broken: analytic against autograd 1e-9, against numeric 1e-6, relative to the norm of the row, float64; less than 2
-percent excluded in the typical regime.
+Every term (silhouettes and photometric in both forms, points, all priors) has its hand-derived Jacobian compared with
+autograd and with central differences (Richardson extrapolation over a sweep of steps), and its gradient the derivative
+by autograd with differences. Entries that differences cannot judge, as their own estimate of error says, are excluded
+and counted. A term of one's own, `--term module:factory`, is examined as the built-in ones are, and its shapes are
+checked. Exit code 1 when a bound is broken: analytic against autograd 1e-9, against numeric 1e-6, relative to the norm
+of the row, float64; less than 2 percent excluded in the typical regime.
 
     python scripts/check_gradients.py --out gradients
-    python scripts/check_gradients.py --term photometric surface_depth --regime typical near_3m --states 12
+    python scripts/check_gradients.py --term photometric silhouettes --regime typical near_3m --states 12
     python scripts/check_gradients.py --term my_terms:upright --regime typical
     python scripts/check_gradients.py --data KITTI --frame 000107 --out gradients_kitti
 
@@ -29,9 +28,15 @@ from command_line import run_command
 
 from directshape_torch.errors import InputError
 from directshape_torch.laboratory.regimes import regimes_named
-from directshape_torch.laboratory.report import summary, write_report
 from directshape_torch.laboratory.scenes import load_scene
-from directshape_torch.laboratory.study import SUBJECT_NAMES, StudyPlan, run_study, subjects_named
+from directshape_torch.laboratory.study import (
+    SUBJECT_NAMES,
+    StudyPlan,
+    run_study,
+    subjects_named,
+    summary,
+    write_report,
+)
 from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
@@ -83,9 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--states", type=int, default=3, metavar="N", help="states in each regime (default 3)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="for jacobians.csv and summary.md")
-    parser.add_argument(
-        "--term", nargs="+", metavar="NAME", help="terms and factors, default all; module:factory for one of your own"
-    )
+    parser.add_argument("--term", nargs="+", metavar="NAME", help="default all; module:factory for one of your own")
     parser.add_argument("--regime", nargs="+", metavar="NAME", help="default all")
     parser.add_argument("--data", type=Path, metavar="ROOT", help="KITTI's layout; default the bundled demo frame")
     parser.add_argument("--frame", metavar="ID", help="frame of --data; default the one with most masked cars")

@@ -30,7 +30,7 @@ _FLAT_SHARE = 1e-6
 class Comparison:
     """One subject in one regime."""
 
-    name: str  # of the factor or term
+    name: str  # of the term, or of its gradient
     regime: str  # of the state
     entries: int  # rows times unknowns
     compared: int  # entries that differences could judge

@@ -1,29 +1,35 @@
-"""One run of the laboratory: which factors and terms, in which regimes; what came of it."""
+"""One run of the laboratory: which terms, in which regimes; what came of it, and as text."""
 
 from __future__ import annotations
 
+import csv
+import io
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import torch
 
 from directshape_torch.errors import InputError
+from directshape_torch.files.atomic_files import write_text
 from directshape_torch.laboratory.bench import TERM_NAMES, TRACK_NAMES, Bench
 from directshape_torch.laboratory.comparison import BOUNDS, Comparison, compare
-from directshape_torch.laboratory.experiments import AT_FIXED_DEPTHS, FACTORS, gradient_experiment, term_experiment
-from directshape_torch.laboratory.regimes import Regime, checked_name, regimes_named
+from directshape_torch.laboratory.experiments import AT_FIXED_DEPTHS, gradient_experiment, term_experiment
+from directshape_torch.laboratory.regimes import REGIMES, Regime, checked_name, regimes_named
 from directshape_torch.laboratory.scenes import LaboratoryScene
 from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
-SUBJECT_NAMES = (*FACTORS, *TERM_NAMES, *TRACK_NAMES)
+SUBJECT_NAMES = (*TERM_NAMES, *TRACK_NAMES)
 
 
 @dataclass(frozen=True)
 class StudyPlan:
     """What to examine."""
 
-    subjects: tuple[str, ...] = SUBJECT_NAMES  # factors and terms by name
+    subjects: tuple[str, ...] = SUBJECT_NAMES  # terms by name
     own_terms: tuple[TermFactory, ...] = ()  # make further terms, which are examined as the others
     regimes: tuple[Regime, ...] = field(default_factory=lambda: tuple(regimes_named(None)))  # by name
     num_states: int = 3  # per regime
@@ -33,14 +39,14 @@ class StudyPlan:
 
 
 def subjects_named(names: Sequence[str]) -> tuple[str, ...]:
-    """The factors and terms of these names.
+    """The terms of these names.
 
     Raises:
         InputError: an unknown name; lists the names.
 
     Examples:
-        >>> subjects_named(["transform"])
-        ('transform',)
+        >>> subjects_named(["photometric"])
+        ('photometric',)
     """
     return tuple(checked_name("term", name, list(SUBJECT_NAMES)) for name in names)
 
@@ -88,10 +94,9 @@ def run_study(
 
 @torch.no_grad()
 def compare_subjects(bench: Bench, names: Sequence[str], second: bool = False) -> list[Comparison]:
-    """The three Jacobians of the named factors and terms at the states of a bench, and those of their gradients."""
+    """The three Jacobians of the named terms at the states of a bench, and those of their gradients."""
     terms = [name for name in names if name in bench.terms]
-    experiments = [FACTORS[name](bench) for name in names if name in FACTORS]
-    experiments += [term_experiment(bench, terms)] if terms else []
+    experiments = [term_experiment(bench, terms)] if terms else []
     twice = [name for name in terms if name not in AT_FIXED_DEPTHS]
     experiments += [gradient_experiment(bench, twice)] if second and twice else []
     return [c for experiment in experiments for c in compare(experiment, bench.regime.name)]
@@ -104,3 +109,75 @@ def _in_a_line(found: Sequence[Comparison]) -> str:
     errors = ", ".join(f"{pair} at most {c.errors[pair]:.0e} ({c.name})" for pair, c in worst.items())
     excluded = sum(sum(c.excluded.values()) for c in found) / max(1, sum(c.entries for c in found))
     return f"{errors}, {100 * excluded:.2f} % excluded"
+
+
+def write_report(out: Path, source: str, plan: StudyPlan, study: StudyResult) -> None:
+    """`jacobians.csv`, a line for each comparison with its exclusions by reason, and `summary.md`."""
+    rules = sorted({rule for c in study.comparisons for rule in c.excluded})
+    rows: list[list[Any]] = [[
+        "subject", "regime", "entries", "compared", "zero_rows", "value_error", *BOUNDS,
+        *(f"excluded: {rule}" for rule in rules),
+    ]]  # fmt: skip
+    for c in study.comparisons:
+        counts = [c.excluded.get(rule, 0) for rule in rules]
+        own = [c.name, c.regime, c.entries, c.compared, c.zero_rows]
+        rows.append([*own, *(f"{x:.3e}" for x in (c.value_error, *(c.errors[pair] for pair in BOUNDS))), *counts])
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    write_text(out / "jacobians.csv", text.getvalue())
+    write_text(out / "summary.md", summary(source, plan, study))
+
+
+def summary(source: str, plan: StudyPlan, study: StudyResult) -> str:
+    """One page: verdict, the worst of each subject, exclusions."""
+    broken = study.broken_bounds()
+    parts = [
+        "# Jacobians three ways",
+        f"Images: {source}. {plan.num_states} states in each of {len(plan.regimes)} regimes, seed {plan.seed}. "
+        "Errors are relative to the norm of the row. Bounds in float64: "
+        + ", ".join(f"{pair} {bound:.0e}" for pair, bound in BOUNDS.items())
+        + ".",
+        "**All bounds hold.**" if not broken else "**Broken bounds:**\n\n" + "\n".join(f"- {b}" for b in broken),
+    ]
+    for regime, count in study.states_without_pixels.items():
+        parts.append(f"{regime}: {count} of {plan.num_states} states see no valid pixel; only their priors count.")
+    sections = {
+        "Largest errors over all regimes, float64": _worst_table(study.comparisons),
+        "Entries that differences cannot judge": _exclusion_table(study.comparisons),
+    }
+    parts += [f"## {title}\n\n{table}" for title, table in sections.items() if table]
+    return "\n\n".join(parts) + "\n"
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """A Markdown table, nothing without rows."""
+    if not rows:
+        return ""
+    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+    return "\n".join(lines + ["| " + " | ".join(str(x) for x in row) + " |" for row in rows])
+
+
+def _worst_table(comparisons: Sequence[Comparison]) -> str:
+    rows = []
+    for name in dict.fromkeys(c.name for c in comparisons):
+        own = [c for c in comparisons if c.name == name]
+        errors = [f"{max(c.errors[pair] for c in own):.1e}" for pair in BOUNDS]
+        worst = max(own, key=lambda c: c.errors["analytic-numeric"]).regime
+        rows.append([name, sum(c.compared for c in own), *errors, worst])
+    return _table(["subject", "entries", *BOUNDS, "worst regime (numeric)"], rows)
+
+
+def _exclusion_table(comparisons: Sequence[Comparison]) -> str:
+    rows = []
+    for regime in dict.fromkeys(c.regime for c in comparisons):
+        own = [c for c in comparisons if c.regime == regime]
+        counts: Counter[str] = Counter()
+        for c in own:
+            counts.update(c.excluded)
+        entries = sum(c.entries for c in own)
+        share = 100 * counts.total() / max(entries, 1)
+        worst = max(own, key=lambda c: c.excluded_share)
+        reasons = ", ".join(f"{reason} {count}" for reason, count in counts.most_common())
+        most = f"{worst.name} {100 * worst.excluded_share:.2f} %"
+        rows.append([regime, REGIMES[regime].explanation, entries, f"{share:.2f} %", most, reasons or "none"])
+    return _table(["regime", "states", "entries", "excluded", "most in", "why"], rows)

@@ -8,7 +8,7 @@ from decimal import Decimal, localcontext
 import pytest
 import torch
 from helpers.twists import REGIMES, twists
-from kornia.geometry.liegroup import Se3
+from kornia.geometry.liegroup import Se3, So3
 from torch.autograd import gradcheck, gradgradcheck
 
 from directshape_torch.errors import InputError
@@ -55,6 +55,18 @@ def test_exp_gradcheck(regime: str) -> None:
     assert gradcheck(se3.exp, twists(regime, 3).requires_grad_())
     if regime in ("uniform", "zero", "near_identity"):
         assert gradgradcheck(se3.exp, twists(regime, 2).requires_grad_())
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-7, 0.7, 3.1415926])
+def test_left_jacobian_of_the_exponential(angle: float) -> None:
+    """`exp(xi + d) = exp(J_l d) exp(xi)` to first order; J_l = sum ad^n / (n + 1)! is a block of an exponential."""
+    twist = torch.cat([torch.tensor([3.0, -1.0, 20.0], dtype=torch.float64), angle * AXIS])
+    v, omega = So3.hat(twist.view(2, 3))
+    ad = torch.block_diag(omega, omega)
+    ad[:3, 3:] = v
+    J = torch.linalg.matrix_exp(torch.cat([torch.cat([ad, torch.eye(6)], 1), torch.zeros(6, 12)]).double())[:6, 6:]
+    expected = torch.einsum("gij,gk->ijk", se3.generators() @ se3.exp(twist), J)
+    torch.testing.assert_close(torch.func.jacfwd(se3.exp)(twist), expected, rtol=1e-10, atol=1e-10)
 
 
 def test_coefficients_of_the_series(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -11,13 +12,23 @@ from torch import Tensor
 
 from directshape_torch.laboratory.comparison import Comparison, compare
 from directshape_torch.laboratory.differences import STEPS
-from directshape_torch.laboratory.experiments import Experiment, Subject, factor_experiment
+from directshape_torch.laboratory.experiments import Experiment, Subject
 
 X = torch.linspace(-1.3, 1.7, 12, dtype=torch.float64)[:, None]
 
 
+def compared(
+    function: Callable[[Tensor], Tensor], analytic: Tensor, autograd: Tensor | None = None
+) -> list[Comparison]:
+    """A function of one number at each of `X`; autograd's derivative is right unless another is given."""
+    if autograd is None:
+        _, autograd = torch.func.jvp(function, (X,), (torch.ones_like(X),))
+    experiment = Experiment((Subject("f", analytic, autograd),), lambda d: [function(X + d)[:, 0]], X.new_ones(1))
+    return compare(experiment, "typical")
+
+
 def sine(analytic: Tensor) -> list[Comparison]:
-    return compare(factor_experiment("sine", torch.sin, X, analytic[:, None]), "typical")
+    return compared(torch.sin, analytic)
 
 
 def test_a_right_jacobian_keeps_its_bounds() -> None:
@@ -42,10 +53,8 @@ def test_nan_is_not_within_a_bound() -> None:
 
 def test_a_row_that_both_jacobians_call_constant_must_not_move() -> None:
     """Differences are the only witness against two Jacobians that are wrong in the same way."""
-    (evaluate, units) = (lambda e: (e.evaluate, e.units))(factor_experiment("f", torch.sin, X, torch.cos(X)[:, None]))
     zero = torch.zeros_like(X)
-    subject = Subject("f", zero, zero)
-    (found,) = compare(Experiment((subject,), evaluate, units), "typical")
+    (found,) = compared(torch.sin, zero, zero)
     assert found.zero_rows == 12
     assert found.errors["analytic-numeric"] == math.inf
 
@@ -56,7 +65,7 @@ def test_a_difference_that_is_no_number_breaks_the_bounds_and_is_not_left_out(re
         return torch.where((x - X).abs() > reach, torch.nan, x)
 
     undefined_steps = sum(step > reach for step in STEPS)
-    (found,) = compare(factor_experiment("f", undefined_beyond, X, torch.ones_like(X)[:, None]), "typical")
+    (found,) = compared(undefined_beyond, torch.ones_like(X))
     assert (found.compared, found.excluded) == (12, {})
     assert bool(found.broken_bounds()) == (undefined_steps > 0)
 

@@ -1,4 +1,4 @@
-"""The bounds hold on a small draw, for every factor and term; `mutate_jacobians.py` says that wrong ones break them."""
+"""The bounds hold on a small draw, for every term; `mutate_jacobians.py` says that wrong ones break them."""
 
 from __future__ import annotations
 
@@ -8,18 +8,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from directshape_torch.geometry import se3
 from directshape_torch.laboratory.bench import TERM_NAMES, TRACK_NAMES, Bench
 from directshape_torch.laboratory.comparison import compare
-from directshape_torch.laboratory.experiments import (
-    AT_FIXED_DEPTHS,
-    FACTORS,
-    forward_mode_columns,
-    gradient_experiment,
-    jacobian,
-    left_jacobian,
-    term_experiment,
-)
+from directshape_torch.laboratory.experiments import AT_FIXED_DEPTHS, gradient_experiment, jacobian, term_experiment
 from directshape_torch.laboratory.regimes import REGIMES
 from directshape_torch.shape.field import field_of
 from directshape_torch.terms import photometric
@@ -29,6 +20,11 @@ from directshape_torch.terms.depth import Closest
 BenchOf = Callable[..., Bench]
 _MORE = {"disparity_offset": ("rig",), "track": TRACK_NAMES}
 _EMPTY = {"grid_border": ("photometric", "photometric_normalised")}
+
+
+def _differenced(regime: str) -> tuple[str, ...]:
+    """In the dear state of a track only those that are nowhere else."""
+    return TRACK_NAMES if regime == "track" else (*TERM_NAMES, *_MORE.get(regime, ()))
 
 
 @pytest.mark.parametrize("regime", REGIMES)
@@ -50,7 +46,7 @@ def test_linear_is_the_derivative_of_residual_in_every_regime(bench_of: BenchOf,
 @pytest.mark.parametrize("regime", ["typical", "contour", "grid_border", "track"])
 def test_terms_against_differences(bench_of: BenchOf, regime: str) -> None:
     """Differences look anew at each displaced state: the cost that is compared has the gradient that is followed."""
-    for found in compare(term_experiment(bench_of(regime), [*TERM_NAMES, *_MORE.get(regime, ())]), regime):
+    for found in compare(term_experiment(bench_of(regime), _differenced(regime)), regime):
         assert found.broken_bounds() == []
         assert found.compared > 0 or found.name in _EMPTY[regime]
 
@@ -152,19 +148,10 @@ def test_a_tracked_pixel_ends_on_the_surface(bench_of: BenchOf) -> None:
     assert float(end.mean()) < 0.3 * float(here.mean())
 
 
-@pytest.mark.parametrize("factor", FACTORS)
-def test_factors(bench_of: BenchOf, factor: str) -> None:
-    for regime in ("typical", "near_pi_rotation"):
-        with torch.no_grad():
-            (found,) = compare(FACTORS[factor](bench_of(regime)), regime)
-        assert found.broken_bounds() == []
-        assert found.compared > 0
-
-
 @pytest.mark.parametrize("regime", ["typical", "disparity_offset", "track"])
 def test_gradients_can_be_differentiated(bench_of: BenchOf, regime: str) -> None:
     """What gradients through a refinement are made of: the derivatives of every row's gradient, by autograd."""
-    names = [name for name in (*TERM_NAMES, *_MORE.get(regime, ())) if name not in AT_FIXED_DEPTHS]
+    names = [name for name in _differenced(regime) if name not in AT_FIXED_DEPTHS]
     with torch.no_grad():
         for found in compare(gradient_experiment(bench_of(regime), names), regime):
             assert found.broken_bounds() == []
@@ -177,12 +164,3 @@ def test_a_depth_that_is_not_attached_is_seen(bench_of: BenchOf, monkeypatch: py
     with torch.no_grad():
         (found,) = compare(gradient_experiment(bench_of("typical"), ["photometric"]), "typical")
     assert found.errors["analytic-numeric"] > 1e-2
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-7, 0.7, 3.1415926])
-def test_left_jacobian_of_the_exponential(angle: float) -> None:
-    """`exp(xi + d) = exp(J_l d) exp(xi)` to first order, against autograd of the package's exponential."""
-    twist = torch.tensor([[3.0, -1.0, 20.0, 0.6 * angle, -0.64 * angle, 0.48 * angle]], dtype=torch.float64)
-    by_autograd = forward_mode_columns(lambda x: se3.exp(x).flatten(1), twist).reshape(4, 4, 6)
-    by_hand = torch.einsum("gij,gk->ijk", se3.generators() @ se3.exp(twist), left_jacobian(twist)[0])
-    torch.testing.assert_close(by_hand, by_autograd, rtol=1e-10, atol=1e-10)

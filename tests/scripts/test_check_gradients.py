@@ -24,7 +24,7 @@ def _small_prior(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_tables_and_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert script.main([*_QUICK, "--term", "shape", "transform", "--out", str(tmp_path)]) == 0
+    assert script.main([*_QUICK, "--term", "shape", "height", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
     assert "far_80m" in printed
     assert "**All bounds hold.**" in printed
@@ -32,7 +32,7 @@ def test_tables_and_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert (tmp_path / "summary.md").read_text() == printed
     header, *lines = (tmp_path / "jacobians.csv").read_text().splitlines()
     assert header.startswith("subject,regime,entries,compared")
-    assert len(lines) == 3
+    assert len(lines) == 4
 
 
 def test_a_wrong_jacobian_makes_the_exit_code_one(
@@ -74,7 +74,7 @@ def test_a_term_of_ones_own(
 
 
 @pytest.mark.parametrize(("option", "message"), [
-    (["--term", "fotometric"], "term: expected one of exp, .*photometric, .*got 'fotometric'"),
+    (["--term", "fotometric"], "term: expected one of silhouettes, .*photometric, .*got 'fotometric'"),
     (["--term", "no_such_module:f"], "--term: expected module:factory, got 'no_such_module:f'"),
     (["--term", "json:nothing_here"], "--term: expected module:factory, got 'json:nothing_here'"),
     (["--regime", "mars"], "regime: expected one of typical, .*got 'mars'"),
