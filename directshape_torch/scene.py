@@ -336,14 +336,26 @@ def _stacked(name: str, masks: Masks, count: int) -> Tensor:
         present = [mask for mask in masks if mask is not None]
         if len(masks) != count or not present or len({mask.shape for mask in present}) > 1:
             got = f"{len(masks)} entries of sizes {sorted({tuple(mask.shape) for mask in present})}"
-            raise InputError(name, f"{count} masks of one size (H, W), or None where a car has none", got)
-        masks = torch.stack([torch.zeros_like(present[0]) if mask is None else mask for mask in masks])
+            cure = "where no car has a mask give torch.zeros(number of cars, H, W)"
+            raise InputError(name, f"{count} masks of one size (H, W), or None where a car has none", got, cure)
+        filled = [torch.zeros_like(present[0]) if mask is None else mask for mask in masks]
+        if len({mask.dtype for mask in filled}) == 1:
+            masks = torch.stack(filled)
+        else:
+            # Bytes of up to 255 beside bool or probabilities: each is read in its own units.
+            masks = torch.stack([_foreground(mask) for mask in filled])
     if masks.dtype == torch.uint8:
         check_shape(name, masks, (count, "H", "W"))
-        # 0 and 1, or shades of grey.
-        return masks.bool() if not masks.numel() or int(masks.max()) <= 1 else masks.float() / 255
+    masks = _foreground(masks)
     check_shape(name, masks, (count, "H", "W"), kind="mask")
     return masks
+
+
+def _foreground(masks: Tensor) -> Tensor:
+    """Masks in bytes, 0 and 1 or shades of grey, as bool or probabilities; others as they are."""
+    if masks.dtype != torch.uint8:
+        return masks
+    return masks.bool() if not masks.numel() or int(masks.max()) <= 1 else masks.float() / 255
 
 
 def boxes_around(

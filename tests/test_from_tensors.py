@@ -102,6 +102,8 @@ def test_masks_of_some_of_the_cars() -> None:
     assert found.box_2d[1].tolist() == [u.min(), v.min(), u.max(), v.max()]
     v, u = (right[0] > 0.5).nonzero().unbind(1)
     assert found.box_2d[0].tolist() == [u.min(), v.min(), u.max(), v.max()]
+    mixed = from_boxes(mask_left=[(left[0] > 0.5).byte() * 255, left[1] > 0.5])
+    assert (mixed.mask_left > 0.5).equal(left > 0.5)
     statuses = DirectShapeRefiner(PRIOR)(STREET.frames, found).status
     assert all(status.name != "no_mask" for status in statuses)
     nothing = from_boxes(mask_left=torch.zeros_like(left), mask_right=None)
@@ -112,8 +114,8 @@ def test_masks_of_some_of_the_cars() -> None:
 def test_masks_are_asked_for_by_name() -> None:
     with pytest.raises(InputError, match="mask_left: expected masks of 2 cars in one image at least"):
         from_boxes(mask_left=None, mask_right=None)
-    with pytest.raises(InputError, match=r"mask_left: expected 2 masks of one size"):
-        from_boxes(mask_left=[None])
+    with pytest.raises(InputError, match=r"mask_left: expected 2 masks of one size.*; where no car has a mask give"):
+        from_boxes(mask_left=[None, None])
     with pytest.raises(InputError, match=r"mask_left: expected 2 masks of one size .*\(3, 4\), \(3, 5\)"):
         from_boxes(mask_left=[torch.zeros(3, 4), torch.zeros(3, 5)])
     with pytest.raises(InputError, match="mask_left: expected bool"):

@@ -162,10 +162,13 @@ def _from_corners(corners: Tensor, form: _Format, convention: str) -> tuple[Tens
     error = (corners - centre[:, None] - sign @ half).norm(dim=-1).amax(dim=1)
     askew = (half @ half.mT / half.square().sum(dim=(1, 2), keepdim=True)).triu(1).abs().amax(dim=(1, 2))
     left_handed = torch.linalg.det(half.double()) < 0
-    wrong = (error > _CORNER_TOLERANCE_M) | (askew > 0.02) | left_handed
+    # Another tool's order turns a box by right angles, which makes a box again: mostly one on its side.
+    height = half[:, 1] if not form.upright else -half[:, 1]
+    rises = height[:, 2 if form.upright else 1] / height.norm(dim=1)
+    wrong = (error > _CORNER_TOLERANCE_M) | (askew > 0.02) | left_handed | (rises < 0.5)
     if wrong.any():
         row = int(wrong.int().argmax())
-        got = f"corners {error[row]:.2f} m from a box, or of a box turned inside out, in row {row}"
+        got = f"corners {error[row]:.2f} m from a box, or of a box turned inside out or on its side, in row {row}"
         cure = "see the order of corners in directshape_torch.geometry.box_formats"
         raise InputError("boxes", f"corners in the order of {convention!r}", got, cure)
     length_height_width = 2 * half.norm(dim=2)

@@ -89,6 +89,15 @@ def test_corners_in_another_order_are_refused() -> None:
     mirrored = corners[:, [4, 5, 6, 7, 0, 1, 2, 3]]
     with pytest.raises(InputError, match="turned inside out"):
         boxes_to_poses(mirrored, "kitti")
+    # A permutation of the axes makes a box again, with a car that lies on its side.
+    others: tuple[tuple[BoxFormat, BoxFormat], ...] = (
+        ("mmdet3d_camera", "kitti"),
+        ("kitti", "mmdet3d_camera"),
+        ("nuscenes", "mmdet3d_lidar"),
+    )
+    for written, read in others:
+        with pytest.raises(InputError, match=rf"in the order of '{read}', got .* on its side, in row 0"):
+            boxes_to_poses(tools_corners(written)[None], read, MOTION.get(written))
 
 
 def test_lidar_boxes_need_the_motion_to_the_camera() -> None:
