@@ -72,9 +72,9 @@ def size_error(
     return error if abs(error) < _LARGEST_SIZE_ERROR else 0.0
 
 
-# A reduced observation, pixels: place in the left image, measured disparity, the same less the implied one and its
-# standard deviation by the car's own spread, measured less predicted row and its standard deviation; and the relative
-# error of the box's depth by the size of its mask, 0 where it is not known.
+# A reduced observation, pixels: place in the left image, measured disparity (`Rig.of_depth`), the same less the implied
+# one and its standard deviation by the car's own spread, measured less predicted row and its standard deviation; and
+# the relative error of the box's depth by the size of its mask, 0 where it is not known.
 COLUMNS = ("u", "v", "disparity", "offset", "sigma", "row_offset", "row_sigma", "size_error")
 
 _NEAREST_M, _FARTHEST_M = 5.0, 70.0
@@ -129,7 +129,7 @@ def _row_of_car(detections: Detections, car: int, pair: MatchedPair, rig: Rig) -
     found = pair.aligned(uv, pair.matched[v, u], implied_row)
     kept, focal_baseline = found.reliable, rig.K_left[0, 0] * -rig.T_right_cam[0, 3]
     offset, row_offset = (found.disparity - implied)[kept], (implied_row - found.row_shift)[kept]
-    reduced = _reduced(uv[kept], found.disparity[kept], offset, row_offset, focal_baseline)
+    reduced = _reduced(uv[kept], rig.of_depth(found.disparity[kept]), offset, row_offset, focal_baseline)
     size = size_error(T_cam_obj, hwl, inside, rig.K_left) if bool(detections.has_mask_left[car]) else 0.0
     return None if reduced is None else torch.cat([reduced, reduced.new_tensor([size])])
 
@@ -149,7 +149,7 @@ def _pixels_of_car(detections: Detections, car: int, T_cam_obj: Tensor, hwl: Ten
 
 def _reduced(
     uv: Tensor,  # (P, 2)
-    disparity: Tensor,  # (P,) measured
+    disparity: Tensor,  # (P,) measured, see `Rig.of_depth`
     offset: Tensor,  # (P,)
     row_offset: Tensor,  # (P,)
     focal_baseline: Tensor,  # () pixels x metres

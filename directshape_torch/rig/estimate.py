@@ -83,7 +83,7 @@ class RigEstimate(nn.Module):
         """Take in what the detections of further frames say.
 
         Args:
-            frames: of this rig; each frame once.
+            frames: of this rig; of a frame that was taken in before nothing is counted again.
             detections: of any detector, always the same; left masks help.
 
         Raises:
@@ -99,7 +99,8 @@ class RigEstimate(nn.Module):
         largest = float(rows.detach().abs().amax()) if len(rows) else 0.0
         if not largest <= _LARGEST_PX:
             raise InputError("rows", f"finite pixels of at most {_LARGEST_PX:g}", f"{largest:g}")
-        rows = torch.cat([self.rows, rows.detach().to(self.rows)])
+        # The same frame again says nothing new.
+        rows = torch.cat([self.rows, rows.detach().to(self.rows)]).unique(dim=0)
         # The same rows are kept, in the same order, however they came.
         key = (rows[:, :4] * rows.new_tensor([0.754877, 0.569840, 0.430159, 0.324718])).sum(dim=1) % 1
         self.rows, self._solved = rows[key.argsort()[:_MOST_ROWS]], None

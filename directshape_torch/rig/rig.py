@@ -36,6 +36,10 @@ class Rig(NamedTuple):
         """True disparity and row shift (P, 2) of left pixels (P, 2) of known depth (P,)."""
         return disparity_of_depth(uv_left, depth, *self[1:])
 
+    def of_depth(self, disparity: Tensor) -> Tensor:
+        """What of disparities (P,) falls as 1 / depth: all but what principal points that differ add everywhere."""
+        return disparity - (self.K_left[0, 2] - self.K_right[0, 2])
+
     def depth(self, uv_left: Tensor, disparity: Tensor) -> Tensor:
         """Depth (P,) of left pixels (P, 2) with a true disparity (P,); NaN where no point in front has it."""
         return depth_from_disparity(uv_left, disparity, *self[1:])

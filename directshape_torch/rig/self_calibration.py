@@ -226,7 +226,7 @@ class RoadConstraint(FieldConstraint):
         rays_cam = rays_from_pixels(self.uv, self.rig.K_left)
         predicted, slope = self.disparity(rays_cam, self.inverse_depth(coefficients))
         basis = polynomial_basis(self.uv, self.rig.size_wh)
-        sigma = (PATCH_SIGMA_PX**2 + (_UNEVENNESS * self.seen[:, 2:3]) ** 2).sqrt()
+        sigma = (PATCH_SIGMA_PX**2 + (_UNEVENNESS * self.rig.of_depth(self.seen[:, 2:3])) ** 2).sqrt()
         residual = (predicted + basis @ coefficients - self.seen[:, 2])[:, None] / sigma
         return residual, (torch.cat([slope[:, None] * rays_cam, basis], dim=1) / sigma)[:, None]
 

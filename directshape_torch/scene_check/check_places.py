@@ -53,17 +53,18 @@ def measure_cars(frame: FrameEvidence, left: NDArray[np.uint8], right: NDArray[n
     """What both images (H, W, 3) say of the cars that have a tall enough left mask and are in front of the camera.
 
     Returns:
-        (N, 3) disparity in pixels, and over the distance of the box that by disparity and that by the height of the
+        (N, 3) disparity in pixels as it were with equal principal points, and over the distance of the box that by disparity and that by the height of the
         mask, which needs no baseline.
     """
-    around = frame.mask_boxes["left"]
+    around, camera = frame.mask_boxes["left"], frame.camera
+    shift = float(camera.K_left[0, 0, 2] - camera.K_right[0, 0, 2])
     with np.errstate(invalid="ignore"):
         tall = (around[:, 3] - around[:, 1] >= _MIN_HEIGHT_PX) & (frame.boxes.location[:, 2] > 0)
     rows = []
     for car in np.flatnonzero(tall).tolist():
         disparity = patch_disparity(left, right, around[car])
         if np.isfinite(disparity):
-            rows.append((disparity, *_ratios(frame, car, disparity)))
+            rows.append((disparity - shift, *_ratios(frame, car, disparity)))
     return np.array(rows, dtype=np.float64).reshape(-1, 3)
 
 

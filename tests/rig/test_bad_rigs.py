@@ -39,7 +39,7 @@ EVIDENCE = {
     "half of them wrong by 5 px": (changed(RIGHT, 3, lambda x: x + 5 * (torch.arange(len(x)) % 2)), 0.2),
     "all on the left": (rows_of_cars(40, 1, u_range=(20, 300)), 0.1),
     "all at one pixel": (changed(changed(RIGHT, 0, lambda x: 0 * x + 600), 1, lambda x: 0 * x + 190), 0.1),
-    "the same detection forty times": (RIGHT[:1].repeat(40, 1), 0.1),
+    "the same detection forty times": (RIGHT[:1].repeat(40, 1), 0.2),
     "a detector without skill": (rows_of_cars(40, 3, noise=0.4), 0.2),
     "a detector 30 % too near": (rows_of_cars(40, 4, bias=-0.3), 0.1),
     "boxes of other images": (changed(RIGHT, 3, lambda x: x[torch.arange(len(x)).flip(0)] * 9), 0.2),

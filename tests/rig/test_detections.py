@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 
 import directshape_torch
-from directshape_torch import DirectShapeRefiner, RigEstimate
+from directshape_torch import DirectShapeRefiner, RigEstimate, check_scene
 from directshape_torch.errors import InputError
 from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
 from directshape_torch.rig.detections import observe_detections, size_error
 from directshape_torch.scene import Detections, FrameBatch
 
 DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
-OFFSET, ROW_OFFSET = 3, 5
+DISPARITY, OFFSET, ROW_OFFSET = 2, 3, 5
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +55,22 @@ def test_true_boxes_see_what_the_right_image_is_warped_by(demo: LoadedFrame) -> 
     seen = observe_detections(warped(demo.frame, 0.8, 0.3), demo.detections)
     assert difference(seen, OFFSET, exact) == pytest.approx(0.8, abs=0.1)
     assert difference(seen, ROW_OFFSET, exact) == pytest.approx(0.3, abs=0.1)
+
+
+def with_other_principal_point(frames: FrameBatch, by_px: float) -> FrameBatch:
+    """The right image cut so far to the right, and its intrinsics with it."""
+    K_right = frames.camera.K_right.clone()
+    K_right[:, 0, 2] -= by_px
+    return replace(warped(frames, by_px, 0.0), camera=replace(frames.camera, K_right=K_right))
+
+
+def test_principal_points_that_differ_change_no_observation(demo: LoadedFrame) -> None:
+    exact = observe_detections(demo.frame, demo.detections)
+    moved = observe_detections(with_other_principal_point(demo.frame, 40.0), demo.detections)
+    for column in (DISPARITY, OFFSET):
+        assert difference(moved, column, exact) < 0.1
+    swapped = check_scene(with_other_principal_point(demo.frame, -60.0), demo.detections, match_images=False)
+    assert "images_swapped" not in str(swapped)
 
 
 def test_boxes_that_are_far_off_or_not_there_say_nothing(demo: LoadedFrame) -> None:
