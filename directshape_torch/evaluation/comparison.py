@@ -12,7 +12,7 @@ import numpy as np
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.bootstrap import CarBootstrap, Estimate, MetricSummary, Statistic
-from directshape_torch.evaluation.matching import files_of_frames, is_counted, match_to_labels, named_frames
+from directshape_torch.evaluation.matching import chosen_frames, files_of_frames, is_counted, match_to_labels
 from directshape_torch.evaluation.pose_error import CarErrors, errors_of
 from directshape_torch.io.kitti_labels import KittiObject, objects_in, objects_path
 from directshape_torch.io.result_files import read_shapes
@@ -99,7 +99,7 @@ def compare_results(
             have the same lines in the same order; a detection takes its label by the 2D box of `before`.
         split: file with one frame id a line; default every frame of `before_dir`; where that is of the tracking
             benchmark, those of `after_dir`.
-        frames: ids of the frames to compare, instead of `split`.
+        frames: ids or numbers of the frames to compare, of those.
         shapes_dir: `OUT/shapes` of the refinement, or `OUT`: leaves out detections that had no left mask, and lines
             that were only copied; they still take their labels.
         num_draws, seed: of the confidence intervals.
@@ -109,10 +109,10 @@ def compare_results(
         InputError: no frames.
     """
     sources = Path(labels_dir), Path(before_dir), Path(after_dir)
-    named = named_frames(frames, split)
-    frame_ids = _frames_of(*sources[1:]) if named is None else named
-    if not frame_ids:
+    known = _frames_of(*sources[1:])
+    if not known:
         raise InputError("frames", f"at least one frame; result files NNNNNN.txt in {before_dir}", "none")
+    frame_ids = chosen_frames(known, frames, split, f"frames of {before_dir}")
     cars: list[ComparedCar] = []
     if shapes_dir is not None and (below := Path(shapes_dir) / "shapes").is_dir():
         shapes_dir = below

@@ -12,7 +12,7 @@ import torch
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.bootstrap import CarBootstrap, MetricSummary
-from directshape_torch.evaluation.matching import is_counted, match_to_labels, named_frames
+from directshape_torch.evaluation.matching import chosen_frames, is_counted, match_to_labels
 from directshape_torch.evaluation.shape_error import TAUS_M, EstimatedCar, ShapeError, folder_of_maps, segments_of
 from directshape_torch.io.instance_masks import MaskSource, file_of_frame
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
@@ -92,8 +92,8 @@ def evaluate_shapes(
         masks: the segments: a folder (see `mask_source`) or a source. One ray is cast for each pixel of a car's segment
             whose true depth is known.
         labels_dir: default `training/label_2`.
-        frames: ids of the frames, or their numbers; default all that have both shapes and truth.
-        split: file with one frame id a line, instead of `frames`.
+        split: file with one frame id a line; default all that have both shapes and truth.
+        frames: ids of the frames, or their numbers, of those.
         num_draws, seed: of the confidence intervals, which are over cars.
 
     Raises:
@@ -115,7 +115,7 @@ def evaluate_shapes(
         prior=prior,
         prior_sha256=hash_prior(prior),
     )
-    frame_ids = _chosen(inputs, named_frames(frames, split))
+    frame_ids = _chosen(inputs, frames, split)
     found, counts, with_truth = zip(*(_evaluated(inputs, frame_id) for frame_id in frame_ids), strict=True)
     cars = tuple(car for cars_of_frame in found for car in cars_of_frame)
     if not cars:
@@ -144,16 +144,15 @@ class _Inputs(NamedTuple):
     prior_sha256: str
 
 
-def _chosen(inputs: _Inputs, named: tuple[str, ...] | None) -> tuple[str, ...]:
-    known = sorted(path.stem for path in inputs.maps.glob("*.png"))
-    if named is None:
-        named = tuple(frame_id for frame_id in known if shapes_path(inputs.refined_dir, frame_id).is_file())
-    if missing := sorted(set(named) - set(known)):
-        raise InputError("frames", "frames with ground truth", ", ".join(missing[:5]))
-    if not named:
-        where = f"{inputs.refined_dir} has no shapes/NNNNNN.npz of any of the {len(known)} frames with ground truth"
+def _chosen(inputs: _Inputs, frames: Iterable[str | int] | None, split: Path | str | None) -> list[str]:
+    with_truth = sorted(path.stem for path in inputs.maps.glob("*.png"))
+    if frames is not None or split is not None:
+        return chosen_frames(with_truth, frames, split, "frames with ground truth")
+    found = [frame_id for frame_id in with_truth if shapes_path(inputs.refined_dir, frame_id).is_file()]
+    if not found:
+        where = f"{inputs.refined_dir} has no shapes/NNNNNN.npz of any of the {len(with_truth)} frames with truth"
         raise InputError("frames", "refined frames with ground truth", f"none: {where}")
-    return named
+    return found
 
 
 def _evaluated(inputs: _Inputs, frame_id: str) -> tuple[list[EvaluatedCar], int, int]:

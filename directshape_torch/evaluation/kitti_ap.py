@@ -11,7 +11,7 @@ import numpy as np
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.kitti_rules import DIFFICULTIES, Curve, Difficulty, Floats, KittiScene, Metric
-from directshape_torch.evaluation.matching import files_of_frames, named_frames
+from directshape_torch.evaluation.matching import chosen_frames, files_of_frames
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 
 MINIMUM_IOUS = (0.7, 0.5)
@@ -74,8 +74,8 @@ def evaluate_kitti(
         labels_dir: folder of KITTI labels `NNNNNN.txt` (usually `training/label_2`).
         results_dir: folder of result files `NNNNNN.txt` with scores, or above a folder `data` with them. A frame
             without results counts as missed.
-        frames: ids of the frames, or their numbers; default every frame that has labels.
-        split: file with one frame id a line, instead of `frames`.
+        split: file with one frame id a line; default every frame that has labels.
+        frames: ids of the frames, or their numbers, of those.
         object_type: the class to score; labels of its neighbour (Van for Car) are ignored.
 
     Raises:
@@ -83,15 +83,12 @@ def evaluate_kitti(
         InputError: no frame has labels, or none has results, or the class occurs in neither.
     """
     labels, results = _files(labels_dir, "labels"), _files(results_dir, "results")
-    named = named_frames(frames, split)
-    frame_ids = tuple(labels) if named is None else named
+    if not labels:
+        raise InputError("labels", "label files NNNNNN.txt", f"none of these in {labels_dir}")
+    frame_ids = chosen_frames(list(labels), frames, split, f"frames with labels in {labels_dir}")
     with_results = [frame_id for frame_id in frame_ids if frame_id in results]
-    if not frame_ids:
-        raise InputError("labels", "label files NNNNNN.txt, or frames", f"none of these in {labels_dir}")
     if not with_results:
         raise InputError("results", f"result files such as {frame_ids[0]}.txt", f"none of these in {results_dir}")
-    if unknown := [frame_id for frame_id in frame_ids if frame_id not in labels]:
-        raise InputError("labels", f"labels of frame {unknown[0]}, which the split names", "none")
     pairs = [
         (read_objects(labels[frame_id]), _results(results[frame_id]) if frame_id in results else [])
         for frame_id in frame_ids

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.errors import InputError
 from directshape_torch.files.read_files import read_lines
 from directshape_torch.geometry.image_boxes import box_iou
+from directshape_torch.io.frame_layout import frames_among
 from directshape_torch.io.kitti_labels import KittiObject
 
 _MINIMUM_IOU_2D = 0.3
@@ -57,21 +57,15 @@ def files_of_frames(folder: Path) -> dict[str, Path]:
     return {path.stem: path for path in sorted((nested if nested.is_dir() else folder).glob("*.txt"))}
 
 
-def named_frames(frames: Iterable[str | int] | None, split: Path | str | None) -> tuple[str, ...] | None:
-    """Ids of the frames that a caller names: by id or number, or in a file with one a line; None where by neither.
+def chosen_frames(
+    known: Sequence[str], frames: Iterable[str | int] | None, split: Path | str | None, expected: str
+) -> list[str]:
+    """Those of the known frames that a caller names by id or number, or in a file with one a line; all by default.
 
     Raises:
-        InputError: both are given.
+        InputError: unknown ones, in the words for what was expected.
         DataFormatError: the file cannot be read.
-
-    Examples:
-        >>> named_frames([7, "000012", 7], None)
-        ('000007', '000012')
     """
-    if frames is not None and split is not None:
-        raise InputError("frames", "frames or split", "both", "give one of them")
     if split is not None:
-        frames = [line.text for line in read_lines(split)]
-    if frames is None:
-        return None
-    return tuple(dict.fromkeys(f"{frame:06d}" if isinstance(frame, int) else frame for frame in frames))
+        known = frames_among(known, [line.text for line in read_lines(split)], expected)
+    return list(known) if frames is None else frames_among(known, frames, expected)
