@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import NoneType
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
@@ -30,6 +30,10 @@ from directshape_torch.numerics.checks import (
     is_no_rotation,
 )
 from directshape_torch.numerics.records import Dense, TensorRecord
+
+Side = Literal["left", "right"]
+SIDES: tuple[Side, Side] = ("left", "right")
+"""The two images of a frame."""
 
 # Of B cars in an image: (B, H, W), or (H, W) and None for each.
 Masks = Tensor | Sequence[Tensor | None]

@@ -13,8 +13,8 @@ import json
 from pathlib import Path
 
 from directshape_torch.cli.options import add_data_options, add_lidar_option, dataset_of
-from directshape_torch.cli.progress import ProgressBar
-from directshape_torch.data_check.check_dataset import check_dataset, report_content, spread
+from directshape_torch.cli.progress import Bar
+from directshape_torch.data_check.check_dataset import check_dataset, report_content
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_json
 from directshape_torch.scene_check.finding import CheckReport, unreadable
@@ -58,6 +58,5 @@ def _report(args: argparse.Namespace) -> CheckReport:
         expected = f"data in the layout {args.layout!r} (docs/inputs.md)"
         found = unreadable("layout", "all frames", expected, error, "check the path and the layout")
         return CheckReport((found,), 0, 0, 0)
-    with ProgressBar("check") as progress:
-        progress.started(spread(dataset.frame_ids, max_frames))
-        return check_dataset(dataset, max_frames, lambda frame_id: progress.finished(frame_id, None))
+    with Bar(total=min(len(dataset), max_frames or len(dataset)), desc="check", unit="frame") as bar:
+        return check_dataset(dataset, max_frames, lambda _: bar.update())

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from directshape_torch.cli.options import add_run_inputs, inputs_of_run, mask_source
-from directshape_torch.cli.progress import ProgressBar
+from directshape_torch.cli.progress import Bar
 from directshape_torch.errors import InputError
 from directshape_torch.export.export_run import FORMATS, export_run
 from directshape_torch.export.frame_source import ExportOptions
@@ -52,8 +52,8 @@ def run(args: argparse.Namespace) -> int:
     folder = RunFolder(args.run_folder, args.frames)
     inputs = inputs_of_run(args, folder)
     options = _make_options(args, inputs)
-    with ProgressBar("export") as progress:
-        export_run(inputs, args.out, args.format, options, progress)
+    with Bar(total=len(folder.frame_ids), desc="export", unit="frame") as bar:
+        export_run(inputs, args.out, args.format, options, lambda _: bar.update())
     print(f"exported  {len(folder.frame_ids)} frames as {', '.join(dict.fromkeys(args.format))} to {args.out}")
     return 0
 

@@ -7,7 +7,6 @@ iteration, and how it would drift by silhouettes alone. docs/outputs.md shows th
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -122,7 +121,7 @@ def inspect_frame(
     drawn = [row for row in rows if trace.place_of(row) >= 0]
     silhouettes = silhouette_trace(refiner, loaded) if drawn else None
     truth = true_corners_cam(loaded)
-    for row in Bar(drawn, unit="car", desc=f"frame {loaded.frame_id}", file=sys.stderr):
+    for row in Bar(drawn, unit="car", desc=f"frame {loaded.frame_id}"):
         folder, car = out_dir / f"{loaded.frame_id}_{line_of(loaded, row)}", CarCourse(loaded, trace, row, truth[row])
         for name, figure in _FIGURES.items():
             write_png(folder / name, figure(car))

@@ -151,7 +151,7 @@ def _rigs_of_run(dataset: StereoDataset, rig: str, out_dir: Path, fresh: bool) -
         for estimate in kept:
             print(f"{estimate} (kept)")
         return kept, False
-    with Bar(desc="rig", unit="frame", file=sys.stderr) as bar:
+    with Bar(desc="rig", unit="frame") as bar:
         rigs = estimate_rigs(dataset, lambda _: bar.update())
     for estimate in rigs:
         print(estimate)

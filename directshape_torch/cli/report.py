@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 from directshape_torch.cli.options import add_run_inputs, inputs_of_run
-from directshape_torch.cli.progress import ProgressBar
+from directshape_torch.cli.progress import Bar
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.report.make_report import make_report
 
@@ -35,8 +35,8 @@ def run(args: argparse.Namespace) -> int:
     run_folder = RunFolder(args.out, args.frames)
     page = args.out / "report.html" if args.html is None else args.html
     inputs = inputs_of_run(args, run_folder)
-    with ProgressBar("report") as progress:
-        outcome = make_report(inputs, page, most_frames=args.max_frames, observer=progress)
+    with Bar(total=min(len(run_folder.frame_ids), args.max_frames), desc="report", unit="frame") as bar:
+        outcome = make_report(inputs, page, most_frames=args.max_frames, tell=lambda _: bar.update())
     for note in outcome.notes:
         print(f"note: {note}", file=sys.stderr)
     print(f"page     {outcome.path}  {outcome.num_bytes / 1e6:.1f} MB")

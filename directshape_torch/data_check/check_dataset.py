@@ -29,7 +29,7 @@ _SURE = 2.0  # standard deviations
 def check_dataset(
     dataset: StereoDataset,
     max_frames: int | None = DEFAULT_MAX_FRAMES,
-    tell: Callable[[str], None] = lambda _: None,
+    tell: Callable[[str], object] = lambda _: None,
 ) -> CheckReport:
     """Look for everything that is commonly wrong with a data set.
 

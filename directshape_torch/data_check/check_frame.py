@@ -14,10 +14,11 @@ from directshape_torch.errors import DataFormatError, DirectShapeError
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_detections import match_masks
 from directshape_torch.io.image_files import as_pair, read_rgb
-from directshape_torch.io.instance_masks import SIDES, InstanceMask, MaskSizeError
+from directshape_torch.io.instance_masks import InstanceMask, MaskSizeError
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.stereo_dataset import StereoDataset
+from directshape_torch.scene import SIDES
 from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence
 from directshape_torch.scene_check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, check_images
 from directshape_torch.scene_check.finding import Finding, names, unreadable

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from directshape_torch.batch.options import RunObserver
 from directshape_torch.errors import InputError
 from directshape_torch.export.box_files import Coco3dExporter, KittiExporter, NuscenesExporter
 from directshape_torch.export.frame_source import Exporter, ExportOptions, FrameSource
@@ -32,7 +31,7 @@ def export_run(
     folder: Path | str,
     formats: Sequence[str],
     options: ExportOptions | None = None,
-    observer: RunObserver | None = None,
+    tell: Callable[[str], object] = lambda _: None,
 ) -> None:
     """Write the finished frames of a run in other formats (docs/outputs.md). The run itself is only read.
 
@@ -42,7 +41,7 @@ def export_run(
             earlier export that have the same names are replaced.
         formats: of `FORMATS`.
         options: looks and details.
-        observer: is told of each frame.
+        tell: called after each frame.
 
     Raises:
         MissingDependencyError: "rerun" without Rerun.
@@ -57,18 +56,16 @@ def export_run(
         raise InputError("formats", f"of {', '.join(FORMATS)}", repr(unknown[0]))
     if options.refiner is not None and not inputs.has_detections:
         raise InputError("detections", "those of the run, to refine its frames again", "none")
-    observer = RunObserver() if observer is None else observer
     exporters = [FORMATS[name](Path(folder), inputs, options) for name in dict.fromkeys(formats)]
     with ExitStack() as stack:
         for exporter in exporters:
             stack.callback(exporter.abandon)
-        observer.started(run.frame_ids)
         for frame_id in run.frame_ids:
             # What is read or made of a frame serves all of them.
             source = FrameSource(inputs, frame_id, options)
             for exporter in exporters:
                 exporter.add(source)
-            observer.finished(frame_id, None)
+            tell(frame_id)
         for exporter in exporters:
             exporter.finish()
         stack.pop_all()

@@ -21,9 +21,7 @@ from directshape_torch.files.schema import record_of
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.image_boxes import project_boxes
 from directshape_torch.io.instance_masks import (
-    SIDES,
     InstanceMask,
-    Side,
     check_count,
     instance_of,
     read_mask,
@@ -31,6 +29,7 @@ from directshape_torch.io.instance_masks import (
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera, upright_plane
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
 from directshape_torch.numerics.checks import is_no_rotation
+from directshape_torch.scene import SIDES, Side
 
 FOLDER_SCHEMA_VERSION = 1
 _CURE = "see docs/inputs.md"

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from directshape_torch.geometry.image_boxes import box_iou, project_boxes
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.instance_masks import SIDES, InstanceMask, Side
+from directshape_torch.io.instance_masks import InstanceMask
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam
-from directshape_torch.scene import Detections, Occluders
+from directshape_torch.scene import SIDES, Detections, Occluders, Side
 
 MIN_OVERLAP = 0.3
 # Two masks of one image that share more than this are the same object seen twice by the segmentation.

@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, shown
 from directshape_torch.io.image_files import read_single_channel
+from directshape_torch.scene import Side
 
-Side = Literal["left", "right"]
-SIDES: tuple[Side, Side] = ("left", "right")
 # All masks of an image together: four bytes each where they are soft.
 _MOST_PIXELS = 2**30
 # More than any outline has; rasterising takes memory for each pixel of it, wherever it lies.

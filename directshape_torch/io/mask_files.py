@@ -16,9 +16,7 @@ from directshape_torch.io import folder_files
 from directshape_torch.io.frame_layout import FrameLayout
 from directshape_torch.io.image_files import find_image, read_single_channel
 from directshape_torch.io.instance_masks import (
-    SIDES,
     InstanceMask,
-    Side,
     check_count,
     check_size,
     decode_segmentation,
@@ -27,6 +25,7 @@ from directshape_torch.io.instance_masks import (
     read_mask,
     tight_box,
 )
+from directshape_torch.scene import SIDES, Side
 
 COCO_CAR_IDS = frozenset({3})
 # KITTI MOTS numbers its classes 1 car, 2 pedestrian, 10 ignore; Cityscapes from 24 on, 26 being car.

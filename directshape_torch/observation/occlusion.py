@@ -18,9 +18,8 @@ from torch import Tensor
 from directshape_torch.errors import InputError
 from directshape_torch.observation.extents import SceneExtents, scene_extents
 from directshape_torch.rows import OcclusionMap
-from directshape_torch.scene import MASK_THRESHOLD, Detections
+from directshape_torch.scene import MASK_THRESHOLD, Detections, Side
 
-Side = Literal["left", "right"]
 OcclusionOrder = Literal["depth", "box_bottom"]
 
 

@@ -16,9 +16,9 @@ from directshape_torch.config import SamplingConfig, SamplingMode
 from directshape_torch.geometry.camera import rays_from_pixels, right_rays
 from directshape_torch.image.grey_levels import gradient_magnitude_at, gradient_magnitude_of_part
 from directshape_torch.observation.extents import SceneExtents, region_boxes, scene_extents
-from directshape_torch.observation.occlusion import Side, occlusion_map
+from directshape_torch.observation.occlusion import occlusion_map
 from directshape_torch.rows import OcclusionMap, PixelSamples, PointSamples
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene import SIDES, Detections, FrameBatch, Side
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def pack_pixels(
     """
     extents = scene_extents(detections) if extents is None else extents
     regions = car_regions(frames, detections, extents)
-    sides: tuple[Side, Side] = ("left", "right")
+    sides: tuple[Side, Side] = SIDES
     hidden_left, hidden_right = (
         occlusion_map(detections, side, config.occlusion_order, extents) if config.occlusion else None for side in sides
     )

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import statistics
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.batch.options import RunObserver
 from directshape_torch.batch.run_log import read_log
 from directshape_torch.batch.run_status import read_status
 from directshape_torch.errors import InputError
@@ -40,7 +39,7 @@ class ReportOutcome:
 
 
 def make_report(
-    inputs: RunInputs, page: Path, *, most_frames: int = 100, observer: RunObserver | None = None
+    inputs: RunInputs, page: Path, *, most_frames: int = 100, tell: Callable[[str], object] = lambda _: None
 ) -> ReportOutcome:
     """Write the page of the chosen frames of a run.
 
@@ -49,7 +48,7 @@ def make_report(
             boxes alone, and saved meshes.
         page: the HTML file to write.
         most_frames: frames with pictures and 3D views at most; all cars are in the table all the same.
-        observer: is told of each frame with details.
+        tell: called after each frame with details.
 
     Raises:
         DataFormatError: a damaged file in the run.
@@ -60,7 +59,6 @@ def make_report(
         raise InputError("most_frames", "0 or more", str(most_frames))
     check_file("page", page)
     run, mean, config = inputs.run, inputs.mean, inputs.run.refiner_config()
-    observer = RunObserver() if observer is None else observer
     rows: list[CarRow] = []
     grounds: Counter[str] = Counter()
     for number, frame_id in enumerate(run.frame_ids):
@@ -69,7 +67,6 @@ def make_report(
         rows += car_rows(number, frame.result, frame.detections, frame.labels)
     detailed = choose_frames(rows, len(run.frame_ids), most_frames)
     head, foot = page_frame(f"{run.path.resolve().name}: refined cars")
-    observer.started([run.frame_ids[number] for number in detailed])
     with replaced_file(page) as content, TextIOWrapper(content, "utf-8", "replace", newline="\n") as file:
         file.write(head)
         if mean is not None:
@@ -77,7 +74,7 @@ def make_report(
         for number in detailed:
             for part, value in frame_details(RunFrame(inputs, run.frame_ids[number]), config).items():
                 file.write(data_block(f"{part}-{number}", value))
-            observer.finished(run.frame_ids[number], None)
+            tell(run.frame_ids[number])
         notes = _notes(inputs, len(detailed))
         file.write(data_block("frames", {"ids": list(run.frame_ids), "detailed": detailed}))
         file.write(

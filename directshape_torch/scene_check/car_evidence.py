@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 import torch
@@ -13,11 +12,9 @@ from torch import Tensor
 from directshape_torch.geometry.box3d import rotation_y_from_pose
 from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.scene import Detections, FrameBatch, boxes_around
+from directshape_torch.scene import SIDES, Detections, FrameBatch, Side, boxes_around
 from directshape_torch.stereo_matching.disparity import rgb8
 
-Side = Literal["left", "right"]
-SIDES: tuple[Side, Side] = ("left", "right")
 Floats = NDArray[np.float64]
 Pair = tuple[NDArray[np.uint8], NDArray[np.uint8]]  # left and right image, (H, W, 3) RGB
 

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 
 from directshape_torch.config import SamplingMode
 from directshape_torch.errors import InputError
-from directshape_torch.io.instance_masks import SIDES
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.observation.occlusion import Side
 from directshape_torch.observation.packing import pack_pixels, residual_offsets
 from directshape_torch.observation.refinable import without_empty_masks
+from directshape_torch.scene import SIDES, Side
 from directshape_torch.visualize.drawing import (
     BLUE,
     GREEN,

@@ -126,7 +126,7 @@ def test_frames_and_split_choose(folders: tuple[Path, Path, Path], tmp_path: Pat
     (tmp_path / "split.txt").write_text("000002\n")
     assert compare_results(*folders, split=tmp_path / "split.txt").overall.num_detections == 1
     assert compare_results(*folders, frames=[1]).overall.num_detections == 2
-    with pytest.raises(InputError, match="frames: expected frames of .*, such as 000002, got 1"):
+    with pytest.raises(InputError, match=r"frames: expected frames of .*, such as 000002, got 1"):
         compare_results(*folders, split=tmp_path / "split.txt", frames=[1])
 
 

@@ -151,5 +151,5 @@ class TestFilesAndErrors:
             evaluate_kitti(folders[0], tmp_path / "empty")
 
     def test_a_split_with_a_frame_that_has_no_labels(self, folders: tuple[Path, Path]) -> None:
-        with pytest.raises(InputError, match="frames with labels in .*, such as 000001, got 000009"):
+        with pytest.raises(InputError, match=r"frames with labels in .*, such as 000001, got 000009"):
             evaluate_kitti(*folders, frames=[1, "000009"])

@@ -164,7 +164,9 @@ def test_errors_name_what_is_wrong(root: Path, tmp_path: Path, capsys: pytest.Ca
         return captured.err
 
     assert "has no shapes/NNNNNN.npz" in fails(tmp_path)
-    assert "frames: expected frames with ground truth, such as 000000, got 9" in fails(root / "perfect", "--frames", "9")
+    assert "frames: expected frames with ground truth, such as 000000, got 9" in fails(
+        root / "perfect", "--frames", "9"
+    )
     assert "000000.npz: cannot be read" in fails(tmp_path, "--frames", "000000")
     (tmp_path / "shapes").mkdir()
     (tmp_path / "shapes" / "000000.npz").write_bytes(b"no archive")

@@ -10,8 +10,8 @@ from reference.occlusion import hidden_pixels as one_by_one
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.observation.occlusion import OcclusionOrder, Side, occlusion_map
-from directshape_torch.scene import Detections, Occluders
+from directshape_torch.observation.occlusion import OcclusionOrder, occlusion_map
+from directshape_torch.scene import Detections, Occluders, Side
 
 HEIGHT, WIDTH = 20, 30
 

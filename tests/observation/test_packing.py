@@ -16,9 +16,8 @@ from directshape_torch.config import SamplingConfig
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.ground_plane import GroundPlane
 from directshape_torch.observation.extents import scene_extents
-from directshape_torch.observation.occlusion import Side
 from directshape_torch.observation.packing import Observation, car_regions, pack_pixels
-from directshape_torch.scene import Detections, FrameBatch, Occluders
+from directshape_torch.scene import Detections, FrameBatch, Occluders, Side
 from tests.helpers.synthetic_scene import stereo_camera
 
 PADDING = 0.77  # grey that must not matter

@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from directshape_torch.observation.occlusion import OcclusionOrder, Side
-from directshape_torch.scene import MASK_THRESHOLD, Detections
+from directshape_torch.observation.occlusion import OcclusionOrder
+from directshape_torch.scene import MASK_THRESHOLD, Detections, Side
 
 
 def instances_in_front(detections: Detections, side: Side, order: OcclusionOrder = "depth") -> Tensor:
