@@ -63,18 +63,19 @@ def box_corners(
 ) -> Tensor:
     """The 8 corners (*, 8, 3) of boxes standing on the origin of their object frame, in frame a.
 
-    Order: the four ground corners (front right of travel first, then round), then the four above them.
+    Order, as in KITTI's devkit: the four ground corners (front left of travel first, then front right and round), then
+    the four above them.
 
     Examples:
         >>> corners = box_corners(torch.eye(4), torch.tensor([1.5, 1.6, 4.0]))
         >>> corners[0]
-        tensor([ 2.0000,  0.0000, -0.8000])
+        tensor([2.0000, 0.0000, 0.8000])
     """
     height, width, length = dimensions_hwl.unbind(-1)
     sign = dimensions_hwl.new_tensor
     x = 0.5 * length[..., None] * sign([1, 1, -1, -1, 1, 1, -1, -1])
     y = -height[..., None] * sign([0, 0, 0, 0, 1, 1, 1, 1])
-    z = 0.5 * width[..., None] * sign([-1, 1, 1, -1, -1, 1, 1, -1])
+    z = 0.5 * width[..., None] * sign([1, -1, -1, 1, 1, -1, -1, 1])
     return transform(T_a_obj[..., None, :, :], torch.stack([x, y, z], dim=-1))
 
 

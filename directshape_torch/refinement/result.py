@@ -253,7 +253,9 @@ class RefinementResult(CarRecord):
         return poses_to_boxes(T_frame_box, dimensions, convention, T_cam_boxes)
 
     def corners(self, frame: Frame = "cam") -> Tensor:
-        """Corners (B, 8, 3) of the same boxes: the four on the ground, from the front right one on, then those above.
+        """Corners (B, 8, 3) of the same boxes in the order of KITTI's devkit, which `Detections.from_boxes` reads.
+
+        The four on the ground, from the front left one on to the front right one and round, then those above.
 
         Raises:
             InputError: a frame that is neither "cam" nor "ref".

@@ -34,7 +34,7 @@ def test_corners_by_hand() -> None:
     # h 1.5, w 2, l 4, heading pi/2 at (10, 1.6, 20): x_obj -> -z_cam, z_obj -> x_cam.
     T = pose_from_kitti(torch.tensor([10.0, 1.6, 20.0]), torch.tensor(math.pi / 2))
     corners = box_corners(T, torch.tensor([1.5, 2.0, 4.0]))
-    expected = [[9, 1.6, 18], [11, 1.6, 18], [11, 1.6, 22], [9, 1.6, 22]]
+    expected = [[11, 1.6, 18], [9, 1.6, 18], [9, 1.6, 22], [11, 1.6, 22]]
     expected += [[x, 0.1, z] for x, _, z in expected]
     torch.testing.assert_close(corners, torch.tensor(expected), atol=1e-5, rtol=0)
 
