@@ -13,8 +13,7 @@ with the box that is returned, refined or not. With `--interval` cars move smoot
 
 Prints tables in markdown: all cars, those that turn to the camera by
 more than `--turn-deg` within their sequence, and median errors of near and far faces by distance. Writes one line a
-car, frame and number of frames to `OUT/cars.csv`. With `--swap` two cars of each sequence exchange their tracks half
-way: both must be split, and nothing may get worse.
+car, frame and number of frames to `OUT/cars.csv`.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ class CarOfFrame:
 
     Attributes:
         track: of the label.
-        given_track: of the detection, another one with `--swap`.
+        given_track: of the detection.
         part: see `RefinementResult.track_part`.
         not_worse: probability of that against the input, NaN where none is known.
         along_sigmas, yaw_sigmas: errors along the viewing ray and of the axis in standard deviations that the result
@@ -103,8 +102,6 @@ def run(args: argparse.Namespace) -> None:
     for _, ids in groupby(dataset.frame_ids, dataset.sequence_of):
         loaded = [dataset.load(frame_id) for frame_id in ids]
         loaded = [_timed(item, number, args.interval) for number, item in enumerate(loaded)]
-        if args.swap:
-            loaded = _swapped(loaded)
         for views in args.views:
             for first in range(0, len(loaded), views):
                 found += _refine(refiner, loaded[first : first + views], views)
@@ -139,7 +136,8 @@ def _cars(
     errors, before = pose_errors(boxes, true), pose_errors(boxes_of([objects[k] for k in rows]), true)
     reach, true_reach = _reach(boxes, true), _reach(true, true)
     status, sigma = result.status, result.sigma_xyz_yaw
-    given, part = _track_id(item).tolist(), result.track_part.tolist()
+    assert item.detections.track_id is not None
+    given, part = item.detections.track_id.tolist(), result.track_part.tolist()
     for number, (k, label) in enumerate(label_of.items()):
         row = first_row + k
         near, far = (reach[number] - true_reach[number]).tolist()
@@ -182,28 +180,6 @@ def _timed(item: LoadedFrame, number: int, interval_s: float | None) -> LoadedFr
     frame = item.frame
     time_s = None if interval_s is None else frame.images_left.new_tensor([number * interval_s])
     return replace(item, frame=replace(frame, time_s=time_s))
-
-
-def _swapped(loaded: Sequence[LoadedFrame]) -> list[LoadedFrame]:
-    """The two tracks of most frames exchanged from the middle frame on."""
-    ids = np.concatenate([_track_id(item).numpy() for item in loaded])
-    known, counts = np.unique(ids[ids >= 0], return_counts=True)
-    if len(known) < 2:
-        return list(loaded)
-    a, b = (int(number) for number in known[np.argsort(-counts, kind="stable")[:2]])
-    middle = len(loaded) // 2
-    return [item if k < middle else _with_exchanged(item, a, b) for k, item in enumerate(loaded)]
-
-
-def _with_exchanged(item: LoadedFrame, a: int, b: int) -> LoadedFrame:
-    ids = _track_id(item)
-    exchanged = torch.where(ids == a, b, torch.where(ids == b, a, ids))
-    return replace(item, detections=replace(item.detections, track_id=exchanged))
-
-
-def _track_id(item: LoadedFrame) -> Tensor:
-    assert item.detections.track_id is not None
-    return item.detections.track_id
 
 
 def table(found: Sequence[CarOfFrame], turn_deg: float) -> list[str]:
@@ -302,7 +278,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--views", type=int, nargs="+", default=[1, 2, 4, 8], help="frames in a call (default 1 2 4 8)")
     parser.add_argument("--turn-deg", type=float, default=20.0, help="(default 20)")
     parser.add_argument("--interval", type=float, metavar="SECONDS", help="between frames; default: not known")
-    parser.add_argument("--swap", action="store_true", help="exchange two tracks half way")
     parser.add_argument("--rig", type=Path, metavar="FILE", help="of 'calibrate-rig' or a run; default: none")
     parser.add_argument("--prior", default="pca", metavar="FILE|NAME", help="shapes (default: %(default)s)")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings, as of 'refine'")

@@ -9,10 +9,9 @@ from typing import Any, Self
 
 import pytest
 import torch
-from helpers.exact_disparity import measured_street
 from helpers.problems import DEFAULT
 from helpers.street_inputs import SETTLED, StreetInputs, with_mode
-from helpers.synthetic_scene import cached_street, disturbed, select
+from helpers.synthetic_scene import cached_street, disturbed, measured_street, select
 from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig, RefinerConfig

@@ -8,9 +8,8 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.exact_disparity import measured_street
 from helpers.problems import DEFAULT
-from helpers.synthetic_scene import disturbed, joined_detections, joined_frames, select
+from helpers.synthetic_scene import disturbed, joined_detections, joined_frames, measured_street, select
 from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig, RefinerConfig
@@ -80,7 +79,6 @@ def test_alternating_creeps_to_where_the_joint_refinement_jumps() -> None:
 def test_a_batch_equals_a_loop_and_order_does_not_matter(method: str) -> None:
     config, (frames, detections) = CONFIGS[method], scene_of()
     both = joined_frames([frames, frames])
-    both = replace(both, disparity=torch.cat([frames.disparity, frames.disparity]))  # type: ignore[list-item]
     other = disturbed(detections, 0.1, 0.03, seed=8)
     together = refine(config, both, joined_detections([detections, other], (120, 160)))
     for alone, rows in ((refined(method), slice(0, 2)), (refine(config, frames, other), slice(2, 4))):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import MISSING, fields, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import Literal
 
@@ -49,7 +49,7 @@ def with_third(change: Callable[[Detections], Detections]) -> tuple[FrameBatch, 
     frames, detections = base()
     third = select(detections, torch.tensor([1]))
     third = change(replace(third, mask_left=0 * third.mask_left, mask_right=0 * third.mask_right))
-    return frames, joined_cars([detections, third])
+    return frames, Detections.joined([detections, third])
 
 
 def assert_others_unchanged(result: RefinementResult) -> None:
@@ -354,7 +354,7 @@ def test_nearer_cars_hide_right_pixels_even_of_cars_without_a_right_mask_and_whe
         mask_right=everything,
     )
     far = replace(select(detections, torch.tensor([1])), has_mask_right=torch.tensor([False]))
-    both = joined_cars([far, wall])
+    both = Detections.joined([far, wall])
     result = refine(frames, both)
     assert result.status[1] is Status.behind_camera
     # Every right pixel is behind the wall, so nothing can be compared photometrically.
@@ -365,8 +365,3 @@ def _at_depth(T_cam_obj: Tensor, depth_m: float) -> Tensor:
     moved = T_cam_obj.clone()
     moved[:, 2, 3] = depth_m
     return moved
-
-
-def joined_cars(parts: list[Detections]) -> Detections:
-    names = [f.name for f in fields(Detections) if f.default is MISSING]
-    return Detections(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.disparity_maps import write_disparity
-from helpers.exact_disparity import exact_disparity
 from helpers.kitti_folder import CODE, input_options, write_data_set
 from helpers.synthetic_scene import TWO_CARS, street
 
@@ -29,7 +28,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("kitti")
     prior = write_data_set(root, ("000000", "000001"))
     scene = street(prior, *TWO_CARS, code=torch.tensor(CODE, dtype=torch.float64))
-    disparity = exact_disparity(prior, scene)[0].numpy()
+    disparity = scene.disparity[0].numpy()
     for name in ("000000", "000001_10"):
         write_disparity(root / "disparity" / f"{name}.png", disparity)
     return root

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import torch
 from helpers.disparity_maps import write_disparity
-from helpers.exact_disparity import exact_disparity
 from helpers.kitti_folder import CODE, input_options, write_data_set
 from helpers.synthetic_scene import TWO_CARS, street
 
@@ -38,7 +37,7 @@ T_CAM_OBJ = pose_from_kitti(torch.tensor(TWO_CARS[0], dtype=torch.float64), torc
 def write_truth(root: Path, prior: PCAShapePrior) -> None:
     """True disparities and depths, with nothing of the library's ray casting; the cars are the same in every frame."""
     scene = street(prior, *TWO_CARS, code=torch.tensor(CODE, dtype=torch.float64))
-    camera, disparity = scene.frames.camera, exact_disparity(prior, scene)[0]
+    camera, disparity = scene.frames.camera, scene.disparity[0]
     v, u = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
     uv = torch.stack([u, v], dim=-1).double()
     depth = depth_from_disparity(uv, disparity, camera.K_left[0], camera.K_right[0], camera.T_right_cam[0])

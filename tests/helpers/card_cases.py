@@ -27,12 +27,11 @@ from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
-from helpers.exact_disparity import measured_street
 from helpers.five_cars import five_cars, with_solver
 from helpers.pretended_card import CARD, CardTensor, noted_waits, pretended_card
 from helpers.priors import prior_of
 from helpers.problems import DEFAULT
-from helpers.synthetic_scene import disturbed
+from helpers.synthetic_scene import disturbed, measured_street
 
 _SHIPPED = load_config("default", ["compile=off"])
 # What two iterations do, all do; `default` goes on until cars leave.

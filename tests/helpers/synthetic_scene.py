@@ -13,7 +13,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.geometry.camera import rays_from_pixels, right_rays
 from directshape_torch.geometry.ground_plane import GroundPlane
-from directshape_torch.geometry.projection import project
+from directshape_torch.geometry.projection import disparity_of_depth, project
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.laboratory.scenes import select_detections
 from directshape_torch.scene import Detections, FrameBatch
@@ -30,6 +30,7 @@ class Street:
     frames: FrameBatch
     detections: Detections
     code: Tensor  # (B, K)
+    disparity: Tensor  # (1, H, W) pixels, exact to rounding; NaN where no car is
 
 
 def stereo_camera(width: int, height: int, focal_px: float, dtype: torch.dtype = torch.float64) -> StereoCamera:
@@ -51,8 +52,8 @@ def _texture(points: Tensor, phase: float) -> Tensor:
 
 def _render_side(
     prior: PCAShapePrior, T_cam_obj: Tensor, code: Tensor, origin_cam: Tensor, ray_cam: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Grey values (P,) and the number of the visible car (P,), -1 for none, of the rays of one camera."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Grey values (P,), depth (P,) and the number of the visible car (P,), -1 for none, of the rays of one camera."""
     ground = (CAMERA_HEIGHT_M - origin_cam[:, 1]) / ray_cam[:, 1].clamp_min(1e-6)
     depth = torch.where(ray_cam[:, 1] > 1e-3, ground, torch.full_like(ground, BACKDROP_M)).clamp_max(BACKDROP_M)
     grey = 0.35 + 0.3 * _texture((origin_cam + depth[:, None] * ray_cam) * 0.4, 0.3)
@@ -66,7 +67,7 @@ def _render_side(
         point_obj = rays.centre + of_car[:, None] * rays.direction
         grey = torch.where(nearer, _texture(0.5 * point_obj, 1.7 + i), grey)
         visible = torch.where(nearer, torch.full_like(visible, i), visible)
-    return grey, visible
+    return grey, depth, visible
 
 
 def street(
@@ -91,9 +92,10 @@ def street(
     uv = torch.stack([u, v], dim=-1).reshape(-1, 2).to(dtype)
     left = rays_from_pixels(uv, camera.K_left)
     right = right_rays(uv, camera.K_right, camera.T_right_cam)
-    images, masks = [], []
+    images, masks, depths = [], [], []
     for origin, ray in ((torch.zeros_like(left), left), (right.origin_cam, right.direction_cam)):
-        grey, visible = _render_side(prior, T_cam_obj, code, origin, ray)
+        grey, depth, visible = _render_side(prior, T_cam_obj, code, origin, ray)
+        depths.append(torch.where(visible >= 0, depth, torch.nan))
         images.append(grey.view(1, 1, height, width).expand(1, 3, height, width).contiguous())
         cars = torch.arange(count)[:, None]
         masks.append((visible[None] == cars).to(dtype).view(count, height, width))
@@ -116,7 +118,9 @@ def street(
         has_mask_left=masks[0].flatten(1).any(1),
         has_mask_right=masks[1].flatten(1).any(1),
     )
-    return Street(frames, detections, code)
+    rig = camera.K_left[0], camera.K_right[0], camera.T_right_cam[0]
+    disparity = disparity_of_depth(uv, depths[0], *rig)[:, 0].view(1, height, width)
+    return Street(frames, detections, code, disparity)
 
 
 TWO_CARS = ([(-1.3, CAMERA_HEIGHT_M, 8.0), (1.9, CAMERA_HEIGHT_M, 12.5)], [0.5, -1.2])
@@ -146,43 +150,23 @@ def joined_frames(parts: list[FrameBatch]) -> FrameBatch:
     """Several frames as one batch, padded at the right and bottom with a value that must not matter."""
     height, width = (max(part.images_left.shape[i] for part in parts) for i in (2, 3))
 
-    def pad(image: Tensor) -> Tensor:
-        return torch.nn.functional.pad(image, (0, width - image.shape[3], 0, height - image.shape[2]), value=0.77)
+    def padded(part: FrameBatch) -> FrameBatch:
+        room = (0, width - part.images_left.shape[3], 0, height - part.images_left.shape[2])
+        images = {name: getattr(part, name) for name in ("images_left", "images_right")}
+        return replace(part, **{n: torch.nn.functional.pad(image, room, value=0.77) for n, image in images.items()})
 
-    cameras = [part.camera for part in parts]
-    camera = StereoCamera(
-        *(torch.cat([getattr(c, n) for c in cameras]) for n in ("K_left", "K_right", "T_right_cam", "t_cam_ref"))
-    )
-    ground = GroundPlane(
-        torch.cat([p.ground.normal for p in parts]),
-        torch.cat([p.ground.offset for p in parts]),
-        tuple(s for p in parts for s in p.ground.source),
-    )
-    return FrameBatch(
-        torch.cat([pad(p.images_left) for p in parts]),
-        torch.cat([pad(p.images_right) for p in parts]),
-        torch.cat([p.sizes for p in parts]),
-        camera,
-        ground,
-        tuple(f"{i:06d}" for i in range(sum(len(p) for p in parts))),
-    )
+    return FrameBatch.joined([padded(part) for part in parts])
 
 
 def joined_detections(parts: list[Detections], size_hw: tuple[int, int]) -> Detections:
     """Detections of consecutive single-frame batches, numbered by frame, masks padded to one size."""
 
-    def pad(mask: Tensor) -> Tensor:
-        return torch.nn.functional.pad(mask, (0, size_hw[1] - mask.shape[2], 0, size_hw[0] - mask.shape[1]))
+    def padded(number: int, part: Detections) -> Detections:
+        room = (0, size_hw[1] - part.mask_left.shape[2], 0, size_hw[0] - part.mask_left.shape[1])
+        masks = {name: torch.nn.functional.pad(getattr(part, name), room) for name in ("mask_left", "mask_right")}
+        return replace(part, frame_index=torch.full_like(part.frame_index, number), **masks)
 
-    def column(name: str) -> Tensor:
-        values = [getattr(part, name) for part in parts]
-        return torch.cat([pad(v) for v in values] if name in ("mask_left", "mask_right") else values)
-
-    names = (
-        "T_cam_obj", "dimensions_hwl", "box_2d", "score", "mask_left", "mask_right", "has_mask_left", "has_mask_right",
-    )  # fmt: skip
-    frame_index = torch.cat([torch.full((len(part),), i) for i, part in enumerate(parts)])
-    return Detections(frame_index=frame_index, **{name: column(name) for name in names})
+    return Detections.joined([padded(number, part) for number, part in enumerate(parts)])
 
 
 @lru_cache(maxsize=4)
@@ -192,3 +176,10 @@ def cached_street(dtype: torch.dtype = torch.float64) -> tuple[PCAShapePrior, St
 
     prior = ellipsoid_prior(dtype)
     return prior, two_car_street(prior)
+
+
+@lru_cache(maxsize=2)
+def measured_street(dtype: torch.dtype = torch.float64) -> tuple[PCAShapePrior, Street]:
+    """The two-car street whose frames bring their exact disparity."""
+    prior, scene = cached_street(dtype)
+    return prior, replace(scene, frames=replace(scene.frames, disparity=scene.disparity))

@@ -13,9 +13,8 @@ from directshape_torch.refinement.problem import CarStage
 from directshape_torch.terms.cars import CarState
 from helpers.derivatives import moved, tangent_of
 from helpers.ellipsoids import ellipsoid_prior
-from helpers.exact_disparity import measured_street
 from helpers.problems import CONFIGS, DEFAULT, begun_stage, with_code
-from helpers.synthetic_scene import Street, cached_street, disturbed, street
+from helpers.synthetic_scene import Street, cached_street, disturbed, measured_street, street
 
 GENERAL_RIGHT = se3.exp(torch.tensor([-0.53, -0.003, 0.004, 0.004, -0.01, 0.002], dtype=torch.float64))
 # A corner that some of the residuals exceed, so that both branches of the norm count.

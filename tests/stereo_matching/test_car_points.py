@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.exact_disparity import measured_street
-from helpers.synthetic_scene import CAMERA_HEIGHT_M
+from helpers.synthetic_scene import CAMERA_HEIGHT_M, measured_street
 
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.errors import InputError

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from helpers.exact_disparity import measured_street
-from helpers.synthetic_scene import cached_street, joined_frames
+from helpers.synthetic_scene import cached_street, joined_frames, measured_street
 
 from directshape_torch.stereo_matching.disparity import with_disparity
 

@@ -7,9 +7,8 @@ from typing import Literal
 
 import torch
 from helpers.ellipsoids import CENTRE_OBJ, HALF_AXES, ellipsoid_prior
-from helpers.exact_disparity import measured_street
 from helpers.problems import begun_stage, figures_at
-from helpers.synthetic_scene import disturbed
+from helpers.synthetic_scene import disturbed, measured_street
 from helpers.term_cases import CLOUD, COMBINED
 from torch import Tensor
 
