@@ -13,20 +13,14 @@ from numpy.typing import NDArray
 
 from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
-from directshape_torch.io.config_files import load_config
 from directshape_torch.io.run_folder import RunFolder
-from directshape_torch.io.stereo_dataset import StereoDataset, open_dataset
-from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.visualize.run_frames import RunInputs
 from helpers.kitti_folder import write_data_set
+from helpers.quick_runs import dataset, refiner
 
 FRAMES = ("000000", "000001")
-# The model of trust does not know toys that have not converged.
-FEW_STEPS = (
-    "stages=[{contour_width_px: 0.5, image_level: 0, max_iterations: 4}]",
-    "acceptance.min_probability_better=0",
-)
 
 
 @dataclass(frozen=True)
@@ -42,7 +36,7 @@ class FinishedRun:
 
     @property
     def dataset(self) -> StereoDataset:
-        return dataset_of(self.root, self.folder().classes)
+        return dataset(self.root, classes=self.folder().classes)
 
     def folder(self, *frames: str) -> RunFolder:
         return RunFolder(self.out, frames or None)
@@ -65,19 +59,6 @@ class FinishedRun:
         return RunInputs(self.folder() if run is None else run, self.prior, dataset, has_detections)
 
 
-def dataset_of(root: Path, classes: tuple[str, ...] = ("Car",)) -> StereoDataset:
-    return open_dataset("kitti", root, root / "detections", root / "masks", classes=classes)
-
-
-def refined(
-    root: Path, out: Path, classes: tuple[str, ...] = ("Car",), meshes: MeshFormat | None = None
-) -> FinishedRun:
-    """Refine a data set, a few iterations a car."""
-    refiner = DirectShapeRefiner(PCAShapePrior.load(root / "prior.safetensors"), load_config(None, FEW_STEPS))
-    refine_dataset(dataset_of(root, classes), refiner, out, RefineOptions(meshes=meshes))
-    return FinishedRun(root, out)
-
-
 def finished_run(
     folder: Path,
     frame_ids: tuple[str, ...] = FRAMES,
@@ -93,7 +74,8 @@ def finished_run(
     if car_type != "Car":
         for path in (*(root / "detections" / "data").glob("*.txt"), *(root / "training" / "label_2").glob("*.txt")):
             path.write_text(path.read_text().replace("Car ", f"{car_type} "))
-    return refined(root, folder / out_name, (car_type,), meshes)
+    refine_dataset(dataset(root, classes=(car_type,)), refiner(root), folder / out_name, RefineOptions(meshes=meshes))
+    return FinishedRun(root, folder / out_name)
 
 
 def by_place(points: NDArray[np.float64]) -> NDArray[np.float64]:

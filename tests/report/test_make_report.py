@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.finished_run import FinishedRun, refined, unpacked
+from helpers.finished_run import FinishedRun, unpacked
+from helpers.quick_runs import refine
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.comparison import compare_results
@@ -161,12 +162,11 @@ def test_few_frames_have_details(finished: FinishedRun, tmp_path: Path) -> None:
 
 
 def test_failed_frames_and_frames_without_cars(finished: FinishedRun, tmp_path: Path) -> None:
-    folder = tmp_path / "again"
-    shutil.copytree(finished.root, folder / "kitti")
-    data_set = folder / "kitti"
-    (data_set / "training/image_3/000000.png").write_bytes(b"no image")
-    (data_set / "detections/data/000001.txt").write_text("")
-    again = refined(data_set, folder / "out")
+    root = Path(shutil.copytree(finished.root, tmp_path / "kitti"))
+    (root / "training/image_3/000000.png").write_bytes(b"no image")
+    (root / "detections/data/000001.txt").write_text("")
+    refine(root, tmp_path / "out")
+    again = FinishedRun(root, tmp_path / "out")
     data = blocks(make_report(again.inputs(), tmp_path / "page.html").path)
     assert list(data["run"]["failed"]) == ["000000"]
     assert data["frames"]["ids"] == ["000001"]
