@@ -23,7 +23,6 @@ from directshape_torch.geometry.image_boxes import project_boxes
 from directshape_torch.io.instance_masks import (
     InstanceMask,
     check_count,
-    instance_of,
     read_mask,
 )
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera, upright_plane
@@ -214,8 +213,9 @@ def masks_of(path: Path, root: Path, size_hw: tuple[int, int]) -> list[InstanceM
                 continue
             probability = read_mask(path, f"mask_{side} of objects[{row}]", mask, size_hw, root)
             box, is_car = entry.box_2d if side == "left" else None, entry.object_class == _CAR
-            found.append(instance_of(side, row, probability, is_car=is_car, box=box, score=entry.score, row=row))
-    return [mask for mask in found if mask is not None]
+            if (probability > 0.5).any():
+                found.append(InstanceMask(side, row, is_car, probability, box, row=row))
+    return found
 
 
 def mask_files(path: Path, root: Path) -> tuple[Path, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,6 +14,9 @@ from numpy.typing import NDArray
 from directshape_torch.errors import DataFormatError, shown
 from directshape_torch.io.image_files import read_single_channel
 from directshape_torch.scene import Side
+
+Box = tuple[float, float, float, float]
+"""(u_min, v_min, u_max, v_max), pixels."""
 
 # All masks of an image together: four bytes each where they are soft.
 _MOST_PIXELS = 2**30
@@ -28,41 +32,28 @@ class MaskSizeError(DataFormatError):
 
 @dataclass(frozen=True)
 class InstanceMask:
-    """One instance in one image."""
+    """One instance in one image; one without a pixel above one half says nothing about a car, and is none."""
 
     side: Side  # the image, "left" or "right"
     instance_id: int  # its number in the file; numbers of the two images need not agree
     is_car: bool  # whether it may be matched to a car
-    # The file's 2D box (u_min, v_min, u_max, v_max), else that of the mask, pixels.
-    box: tuple[float, float, float, float]
-    # The smallest box around the mask, whole pixels, both ends belonging to it.
-    mask_box: tuple[float, float, float, float]
     probability: NDArray[np.bool_] | NDArray[np.float32]  # (H, W), bool or float32 foreground probability in [0, 1]
-    score: float  # the segmentation's, 1 where there is none
+    file_box: Box | None = None  # what the file says of its 2D box
     # Number of the car over the frames of its sequence, -1 where `instance_id` is of one frame alone.
     track_id: int = -1
     # The detection that the file gives it to, counted from 0; None: found by overlap.
     row: int | None = None
 
+    @cached_property
+    def mask_box(self) -> Box:
+        """The smallest box around the mask, whole pixels, both ends belonging to it."""
+        rows, columns = (np.flatnonzero((self.probability > 0.5).any(axis=axis)) for axis in (1, 0))
+        return float(columns[0]), float(rows[0]), float(columns[-1]), float(rows[-1])
 
-def instance_of(
-    side: Side,
-    instance_id: int,
-    probability: NDArray[np.bool_] | NDArray[np.float32],
-    *,
-    is_car: bool,
-    box: Sequence[float] | None = None,
-    score: float = 1.0,
-    track_id: int = -1,
-    row: int | None = None,
-) -> InstanceMask | None:
-    """An instance, whose box is that of its mask where the file has none; None without a pixel above one half."""
-    mask_box = tight_box(probability)
-    if mask_box is None:  # an empty mask says nothing about a car
-        return None
-    u_min, v_min, u_max, v_max = box or mask_box
-    own = (u_min, v_min, u_max, v_max)
-    return InstanceMask(side, instance_id, is_car, own, mask_box, probability, score, track_id, row)
+    @property
+    def box(self) -> Box:
+        """The file's 2D box, else that of the mask."""
+        return self.file_box or self.mask_box
 
 
 class MaskSource(Protocol):
@@ -79,20 +70,6 @@ def file_of_frame(directory: Path, name: str) -> Path:
     """`directory/name`, or `directory/data/name` where that exists."""
     nested = directory / "data" / name
     return nested if nested.is_file() else directory / name
-
-
-def tight_box(probability: NDArray[Any]) -> tuple[float, float, float, float] | None:
-    """The smallest box around the pixels above one half, or None where there are none.
-
-    Examples:
-        >>> tight_box(np.eye(4) > 0)
-        (0.0, 0.0, 3.0, 3.0)
-    """
-    mask = probability if probability.dtype == np.bool_ else probability > 0.5
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if not len(rows):
-        return None
-    return float(columns[0]), float(rows[0]), float(columns[-1]), float(rows[-1])
 
 
 def read_mask(path: Path, where: str, mask: Any, size_hw: tuple[int, int], root: Path) -> NDArray[Any]:

@@ -16,14 +16,13 @@ from directshape_torch.io import folder_files
 from directshape_torch.io.frame_layout import FrameLayout
 from directshape_torch.io.image_files import find_image, read_single_channel
 from directshape_torch.io.instance_masks import (
+    Box,
     InstanceMask,
     check_count,
     check_size,
     decode_segmentation,
     file_of_frame,
-    instance_of,
     read_mask,
-    tight_box,
 )
 from directshape_torch.scene import SIDES, Side
 
@@ -100,9 +99,7 @@ class InstancePngMasks:
             if category in (0, _MOTS_IGNORE_CLASS):
                 continue
             track = value % _IDS_PER_CLASS if self.folders == _TRACKING_FOLDERS else -1
-            found = instance_of(side, value, ids == value, is_car=category in self.car_ids, track_id=track)
-            if found is not None:
-                yield found
+            yield InstanceMask(side, value, category in self.car_ids, ids == value, track_id=track)
 
 
 @dataclass(frozen=True)
@@ -220,27 +217,21 @@ def _from_coco(
             if soft
             else decode_segmentation(path, where, entry.get("segmentation"), size_hw)
         )
-        if tight_box(probability) is None:  # whatever else its entry says
+        if not (probability > 0.5).any():  # whatever else its entry says
             continue
         try:
-            number, score = int(entry.get("instance_id", index)), _finite(entry.get("score", 1.0))
-            is_car, box = int(entry["category_id"]) in car_ids, _file_box(entry)
+            number, is_car = int(entry.get("instance_id", index)), int(entry["category_id"]) in car_ids
+            masks.append(InstanceMask(side, number, is_car, probability, _file_box(entry)))
         except (KeyError, TypeError, ValueError) as error:
             raise DataFormatError(path, f"entry {index}: bad or missing field ({error!r})") from error
-        masks.append(instance_of(side, number, probability, is_car=is_car, box=box, score=score))
-    return [mask for mask in masks if mask is not None]
+    return masks
 
 
-def _finite(value: Any) -> float:
-    number = float(value)
-    if not abs(number) < float("inf"):
-        raise ValueError(f"{number} is not finite")
-    return number
-
-
-def _file_box(entry: Mapping[str, Any]) -> tuple[float, float, float, float] | None:
-    """COCO's [x, y, width, height], whose pixel k spans k .. k + 1, as (u_min, v_min, u_max, v_max) of centres."""
+def _file_box(entry: Mapping[str, Any]) -> Box | None:
+    """COCO's [x, y, width, height], whose pixel k spans k .. k + 1, as a box of centres."""
     if entry.get("bbox") is None:
         return None
-    x, y, width, height = (_finite(value) for value in entry["bbox"])
+    x, y, width, height = (float(value) for value in entry["bbox"])
+    if not np.isfinite([x, y, width, height]).all():
+        raise ValueError(f"bbox {entry['bbox']} is not finite")
     return x, y, x + width - 1, y + height - 1

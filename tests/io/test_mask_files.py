@@ -85,12 +85,12 @@ def test_bad_segmentations(segmentation: Any, message: str) -> None:
 @pytest.mark.parametrize("folder", ["", "data"])
 def test_frame_json(tmp_path: Path, folder: str) -> None:
     entries = [
-        entry(image="left", instance_id=7, bbox=[3, 1, 4, 3], score=0.5),
+        entry(image="left", instance_id=7, bbox=[3, 1, 4, 3]),
         entry(image="right", category_id=1),
     ]
     write_json(tmp_path / folder / "000004.json", entries)
     left, right = mask_source(tmp_path).read("000004", SIZE_HW)
-    assert (left.side, left.instance_id, left.is_car, left.score) == ("left", 7, True, 0.5)
+    assert (left.side, left.instance_id, left.is_car) == ("left", 7, True)
     # [x, y, w, h] covers columns 3..6 and rows 1..3; the mask itself columns 4..5.
     assert left.box == (3, 1, 6, 3)
     assert left.mask_box == (4, 1, 5, 3)
@@ -184,10 +184,10 @@ def test_instance_png_of_the_left_images_alone(tmp_path: Path) -> None:
 
 
 def test_plain_coco_files_of_a_whole_data_set(tmp_path: Path) -> None:
-    left = write_json(tmp_path / "l.json", [entry(image_id=8), entry(image_id=107, score=0.25), entry(image_id="8")])
+    left = write_json(tmp_path / "l.json", [entry(image_id=8), entry(image_id=107), entry(image_id="8")])
     right = write_json(tmp_path / "r.json", [entry(image_id=107)])
     source = CocoFileMasks(left, right)
-    assert [(m.side, m.score) for m in source.read("000107", SIZE_HW)] == [("left", 0.25), ("right", 1.0)]
+    assert [(m.side, m.instance_id) for m in source.read("000107", SIZE_HW)] == [("left", 1), ("right", 0)]
     assert [m.instance_id for m in source.read("000008", SIZE_HW)] == [0, 2]
     assert source.read("000009", SIZE_HW) == []
     assert [m.side for m in CocoFileMasks(None, right).read("000107", SIZE_HW)] == ["right"]

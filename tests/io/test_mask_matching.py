@@ -15,7 +15,7 @@ from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.image_boxes import box_iou, project_boxes
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_detections import match_masks, match_one_to_one, without_duplicates
-from directshape_torch.io.instance_masks import InstanceMask
+from directshape_torch.io.instance_masks import Box, InstanceMask
 
 SIZE_HW = (200, 600)
 
@@ -28,14 +28,10 @@ def camera(bias_px: float | None = None) -> StereoCamera:
     return StereoCamera(K[None], K[None], T_right_cam[None], torch.zeros(1, 3, dtype=torch.float64), field)
 
 
-def mask(
-    box: tuple[int, int, int, int], *, is_car: bool = True, file_box: tuple[int, ...] | None = None
-) -> InstanceMask:
+def mask(box: tuple[int, int, int, int], *, is_car: bool = True, file_box: Box | None = None) -> InstanceMask:
     pixels = np.zeros(SIZE_HW, bool)
     pixels[box[1] : box[3] + 1, box[0] : box[2] + 1] = True
-    whole = tuple(float(n) for n in box)
-    from_file = whole if file_box is None else tuple(float(n) for n in file_box)
-    return InstanceMask("left", 1, is_car, from_file, whole, pixels, 1.0)  # type: ignore[arg-type]
+    return InstanceMask("left", 1, is_car, pixels, file_box)
 
 
 def test_iou_by_hand() -> None:
