@@ -67,14 +67,6 @@ def test_right_rays_undo_the_warp(bias: torch.Tensor | None, vertical: torch.Ten
     torch.testing.assert_close(back.origin_cam + depth_right[:, None] * back.direction_cam, point_cam)
 
 
-def test_right_rays_start_at_the_right_camera() -> None:
-    rays = right_rays(UV, K_RIGHT, GENERAL)
-    centre_right = se3.transform(GENERAL, rays.origin_cam)
-    torch.testing.assert_close(centre_right, torch.zeros_like(centre_right), atol=1e-14, rtol=0)
-    direction_right = rays.direction_cam @ GENERAL[:3, :3].T
-    torch.testing.assert_close(direction_right[:, 2], torch.ones(3, dtype=torch.float64))
-
-
 def test_a_point_behind_the_right_camera_is_finite_and_flagged() -> None:
     behind = torch.eye(4, dtype=torch.float64)
     behind[2, 3] = -30.0
@@ -102,22 +94,7 @@ def test_project_undoes_back_projection(shape: tuple[int, ...]) -> None:
     torch.testing.assert_close(project(depth * rays_from_pixels(uv, K), K), uv)
 
 
-def test_rays_are_k_inverse_with_unit_depth() -> None:
-    uv = torch.tensor([[0.0, 0.0], [321.5, 77.0]], dtype=torch.float64)
-    homogeneous = torch.cat([uv, torch.ones(2, 1, dtype=torch.float64)], dim=1)
-    torch.testing.assert_close(rays_from_pixels(uv, K), homogeneous @ torch.linalg.inv(K).T)
-    assert (rays_from_pixels(uv, K)[:, 2] == 1).all()
-
-
 def test_projection_by_hand() -> None:
     # u = 700 * 2 / 10 + 0.4 * (-1) / 10 + 600 = 739.96; v = 690 * (-1) / 10 + 180 = 111.
     point = torch.tensor([2.0, -1.0, 10.0], dtype=torch.float64)
     torch.testing.assert_close(project(point, K), torch.tensor([739.96, 111.0], dtype=torch.float64))
-
-
-def test_a_batch_of_cameras() -> None:
-    cameras = torch.stack([K, 0.5 * K])
-    cameras[1, 2, 2] = 1
-    point = torch.tensor([2.0, -1.0, 10.0], dtype=torch.float64)
-    both = project(point.expand(2, 3), cameras)
-    torch.testing.assert_close(both[1], 0.5 * both[0])

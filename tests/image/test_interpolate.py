@@ -51,17 +51,6 @@ def test_gradient_is_autograds(seed: int, height: int, width: int, padding: int)
     torch.testing.assert_close(gradient, from_autograd, rtol=0, atol=1e-9)
 
 
-def test_gradcheck_in_uv_and_images() -> None:
-    images = random_images(3, (2, 4, 5)).requires_grad_()
-    frame_index = torch.tensor([0, 1, 1, 0, 1, 0])
-    # Away from grid lines, where the lookup has a kink; one point outside on each axis.
-    uv = torch.tensor([[0.3, 0.6], [2.5, 1.2], [3.7, 2.9], [1.1, 0.4], [5.5, 1.3], [2.2, -0.7]], dtype=torch.float64)
-    uv.requires_grad_()
-    assert torch.autograd.gradcheck(
-        lambda im, x: bilinear_with_gradient(im, frame_index, x)[:2], (images, uv), eps=1e-5, atol=1e-6
-    )
-
-
 def test_outside_is_clamped_flagged_and_flat() -> None:
     image = torch.tensor([[[1.0, 2.0], [5.0, 9.0]]], dtype=torch.float64)
     uv = torch.tensor([[-3.0, 0.5], [9.0, 0.5], [0.5, -1.0], [0.5, 4.0], [torch.inf, -torch.inf]], dtype=torch.float64)

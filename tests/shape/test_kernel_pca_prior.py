@@ -54,12 +54,6 @@ def test_a_curved_family_is_held_by_fewer_codes_than_pca_needs() -> None:
     assert errors[0] < 0.3 * errors[1]
 
 
-def test_its_code_derivative_depends_on_the_code() -> None:
-    prior = kernel_prior()
-    one, other = (prior.coefficients(torch.full((1, 2), z, dtype=torch.float64))[1] for z in (0.0, 1.5))
-    assert (one - other).abs().max() > 1e-3
-
-
 def test_wrong_settings_are_named() -> None:
     with pytest.raises(InputError, match="num_components: expected at least num_codes = 3"):
         KernelPCAShapePrior.fit(arc_samples(8), ORIGIN, SPACING_M, 3, MADE, num_components=2)

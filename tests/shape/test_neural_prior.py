@@ -51,16 +51,6 @@ def test_dimensions_are_a_quadratic_whose_derivative_is_autograds() -> None:
     torch.testing.assert_close(at.J_hwl_code[0], torch.func.jacrev(hwl)(code))
 
 
-def test_both_halves_of_a_car_are_the_same() -> None:
-    shape = NeuralShapePrior.load_bundled().double().bind(torch.ones(1, 8, dtype=torch.float64))
-    points = torch.rand(50, 3, dtype=torch.float64) - torch.tensor([0.5, 1.0, 0.5])
-    mirror = torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
-    index = torch.zeros(50, dtype=torch.long)
-    left, right = (shape.value_and_derivatives(p, index) for p in (points, points * mirror))
-    assert torch.equal(left.value, right.value)
-    torch.testing.assert_close(left.gradient, right.gradient * mirror)
-
-
 def test_points_beyond_one_part_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     prior = small_prior()
     shape = prior.bind(torch.randn(3, 2, dtype=torch.float64))

@@ -52,15 +52,6 @@ def test_unweighted_components_equal_those_of_a_singular_value_decomposition(sam
     torch.testing.assert_close(prior.explained_variance_ratio, singular[:3] ** 2 / (singular**2).sum())
 
 
-def test_codes_of_the_training_samples_are_white(samples):
-    prior = fit_pca(samples, ORIGIN, SPACING_M, 3, MADE, surface_band_m=None)
-    basis = prior.basis.reshape(-1, 3)
-    codes = torch.linalg.lstsq(basis, (samples - prior.mean).flatten(1).T).solution.T
-    torch.testing.assert_close(
-        codes.T @ codes / (len(samples) - 1), torch.eye(3, dtype=torch.float64), atol=1e-8, rtol=0
-    )
-
-
 def test_positive_first_code_makes_the_car_larger(prior):
     code = prior.initial_code(2)
     code[:, 0] = torch.tensor([-1.0, 1.0])

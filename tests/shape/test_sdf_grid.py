@@ -9,11 +9,10 @@ import pytest
 import torch
 import torch.autograd.forward_ad as fwAD
 from helpers.ellipsoids import ellipsoid_prior
-from helpers.priors import KINDS, prior_of
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.shape.field import PackedField, field_of
+from directshape_torch.shape.field import field_of
 from directshape_torch.shape.sdf_grid import GridField, GridShape, Lookup
 from directshape_torch.shape.zero_level import zero_level_extents
 
@@ -119,14 +118,6 @@ def test_the_last_faces_belong_to_their_cells() -> None:
     torch.testing.assert_close(shape.value_and_derivatives(at, index).gradient, by_autograd)
 
 
-def test_continuation_beyond_a_corner_points_away_from_it() -> None:
-    shape = random_shape(1)
-    away = torch.tensor([[0.3, 0.4, 1.2]], dtype=torch.float64)
-    at = shape.value_and_derivatives(LAST + away, torch.zeros(1, dtype=torch.long))
-    torch.testing.assert_close(at.value, shape.values[:, -1, -1, -1] + 1.3)
-    torch.testing.assert_close(at.gradient, away / 1.3)
-
-
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
 def test_points_that_are_not_finite_disturb_no_others(look_up: LookUp, bad: float) -> None:
     field, at, owner = random_shape().field, points(20).mT.reshape(3, 20, 1).contiguous(), torch.arange(20) % 2
@@ -181,23 +172,6 @@ def test_the_gradient_can_be_traced() -> None:
 
 
 OWNERS = torch.tensor([0, 2, 1])
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("leading", [(), (5,)])
-def test_blocks_are_packed_points(kind: str, leading: tuple[int, ...]) -> None:
-    """Value, gradient and code derivative, of points inside and outside of the bounds."""
-    prior = prior_of(kind)
-    shape = prior.bind(0.5 * torch.randn(3, prior.num_codes, dtype=torch.float64))
-    points = 2 * torch.randn(3, *leading, 3, 64, dtype=torch.float64)
-    field, packed = field_of(shape), PackedField(shape)
-    assert isinstance(field, GridField) is isinstance(shape, GridShape)
-    at, expected = field.derivatives(points, OWNERS), packed.derivatives(points, OWNERS)
-    for x, y in zip(at, expected, strict=True):
-        torch.testing.assert_close(x, y, rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(field.value(points, OWNERS), at.value)
-    torch.testing.assert_close(field.gradient(points, OWNERS), at.gradient)
-    assert at.value.shape == (*leading, 3, 64)
 
 
 def test_curvature_along_rays_by_differences() -> None:

@@ -47,24 +47,18 @@ def test_refinement_is_free_of_pixel_locking_gain_and_offset(fraction: float, st
     assert float(error.abs().median()) < 0.04
 
 
-def test_refinement_follows_the_row_shift() -> None:
+@pytest.mark.parametrize(("shift", "start", "tolerance"), [(-2.0, -2.0, 1e-3), (-0.3, 0.0, 0.03)])
+def test_rows_are_followed_and_found_and_do_not_leak_into_the_disparity(
+    shift: float, start: float, tolerance: float
+) -> None:
+    """v_left - v_right = -2: the right image shows the left's row v at v + 2."""
     u, v = np.meshgrid(np.arange(160.0), np.arange(60.0))
-    # v_left - v_right = -2: the right image shows the left's row v at v + 2.
-    left, right = torch.from_numpy(waves(u, v)), torch.from_numpy(waves(u + 6, v - 2))
+    left, right = torch.from_numpy(waves(u, v)), torch.from_numpy(waves(u + 6, v + shift))
     uv = torch.tensor([[70.0, 30.0], [90.0, 25.0]], dtype=torch.float64)
-    start = torch.full((2,), 6.3, dtype=torch.float64)
-    refined = MatchedPair(left, right, left).aligned(uv, start, torch.full((2,), -2.0, dtype=torch.float64))
-    torch.testing.assert_close(refined.disparity, torch.full((2,), 6.0, dtype=torch.float64), atol=1e-3, rtol=0)
-
-
-def test_an_unknown_row_offset_is_found_and_does_not_leak_into_the_disparity() -> None:
-    u, v = np.meshgrid(np.arange(160.0), np.arange(60.0))
-    left, right = torch.from_numpy(waves(u, v)), torch.from_numpy(waves(u + 6, v - 0.3))
-    uv = torch.tensor([[70.0, 30.0], [90.0, 25.0]], dtype=torch.float64)
-    start = torch.full((2,), 6.2, dtype=torch.float64)
-    refined = MatchedPair(left, right, left).aligned(uv, start, torch.zeros(2, dtype=torch.float64))
-    torch.testing.assert_close(refined.row_shift, torch.full((2,), -0.3, dtype=torch.float64), atol=0.03, rtol=0)
-    torch.testing.assert_close(refined.disparity, torch.full((2,), 6.0, dtype=torch.float64), atol=0.03, rtol=0)
+    of_both = torch.ones(2, dtype=torch.float64)
+    refined = MatchedPair(left, right, left).aligned(uv, 6.3 * of_both, start * of_both)
+    torch.testing.assert_close(refined.row_shift, shift * of_both, atol=tolerance, rtol=0)
+    torch.testing.assert_close(refined.disparity, 6 * of_both, atol=tolerance, rtol=0)
 
 
 def test_flat_patches_borders_and_nothing_are_not_reliable() -> None:
