@@ -11,12 +11,22 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs" / "derivations").glob("[!R]*.md"))
 OVERVIEW = (ROOT / "docs" / "derivations" / "README.md").read_text(encoding="utf-8")
+CODE = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "directshape_torch").rglob("*.py"))
 NAMED_TEST = re.compile(r"tests/[\w/]+\.py(?:::\w+)?")
 
 
 def functions_of(path: Path) -> set[str]:
     tree = ast.parse(path.read_text(encoding="utf-8"))
     return {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_symbols_are_names_of_the_code(page: Path) -> None:
+    table = page.read_text(encoding="utf-8").partition("| ours |")[2].partition("\n\n")[0]
+    cells = [name for line in table.splitlines() for name in re.findall("`([^`]+)`", line.split("|")[1])]
+    names = [name for cell in cells for name in re.findall(r"[^\W\d]\w+", cell)]
+    assert names
+    assert not [name for name in names if not re.search(rf"\b{name}\b", CODE)]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
