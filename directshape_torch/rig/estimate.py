@@ -100,7 +100,7 @@ class RigEstimate(nn.Module):
         if not largest <= _LARGEST_PX:
             raise InputError("rows", f"finite pixels of at most {_LARGEST_PX:g}", f"{largest:g}")
         # The same frame again says nothing new.
-        rows = torch.cat([self.rows, rows.detach().to(self.rows)]).unique(dim=0)
+        rows = torch.cat([self.rows, rows.detach().to(self.rows)]).unique(dim=0)  # type: ignore[no-untyped-call]
         # The same rows are kept, in the same order, however they came.
         key = (rows[:, :4] * rows.new_tensor([0.754877, 0.569840, 0.430159, 0.324718])).sum(dim=1) % 1
         self.rows, self._solved = rows[key.argsort()[:_MOST_ROWS]], None

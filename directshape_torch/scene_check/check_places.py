@@ -53,8 +53,8 @@ def measure_cars(frame: FrameEvidence, left: NDArray[np.uint8], right: NDArray[n
     """What both images (H, W, 3) say of the cars that have a tall enough left mask and are in front of the camera.
 
     Returns:
-        (N, 3) disparity in pixels as it were with equal principal points, and over the distance of the box that by disparity and that by the height of the
-        mask, which needs no baseline.
+        (N, 3) disparity in pixels as it were with equal principal points, and over the distance of the box that by
+        disparity and that by the height of the mask, which needs no baseline.
     """
     around, camera = frame.mask_boxes["left"], frame.camera
     shift = float(camera.K_left[0, 0, 2] - camera.K_right[0, 0, 2])

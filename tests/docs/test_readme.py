@@ -57,9 +57,7 @@ def test_each_marked_command_is_one_shell_line(name: str) -> None:
 def test_every_figure_of_the_results_is_in_the_docs() -> None:
     table = README[README.index("## Results") : README.index("## Limits")]
     figures = re.findall(r"\b0\.\d{3}\b", table)
-    known = "".join(
-        (ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("results.md", "tracks_measured.md")
-    )
+    known = "".join((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("results.md", "tracks_measured.md"))
 
     assert len(figures) == 16
     assert not [figure for figure in figures if figure not in known]
