@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 from helpers.faulty_refiners import FEW_STEPS
@@ -27,24 +26,6 @@ def test_a_second_run_does_nothing(shared_kitti: Path, tmp_path: Path) -> None:
     assert summary.timings.calls == []
     assert not (tmp_path / "timings.json").exists()
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.txt")} == before
-
-
-def test_an_interrupted_run_continues_to_the_same_files(shared_kitti: Path, tmp_path: Path) -> None:
-    class Impatient:
-        def started(self, frame_ids: Any) -> None:
-            pass
-
-        def finished(self, frame_id: str, failure: str | None) -> None:
-            if frame_id == FRAMES[0]:
-                raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        refine(shared_kitti, tmp_path / "a", observer=Impatient())
-    assert not (tmp_path / "a" / "data" / f"{FRAMES[1]}.txt").exists()
-    summary = refine(shared_kitti, tmp_path / "a")
-    assert summary.resumed == (FRAMES[0],)
-    refine(shared_kitti, tmp_path / "b")
-    assert result_files(tmp_path / "a") == result_files(tmp_path / "b")
 
 
 def test_further_outputs_are_added_to_finished_frames(shared_kitti: Path, tmp_path: Path) -> None:

@@ -30,12 +30,10 @@ with RunLog(Path(sys.argv[1])) as log:
 def test_a_second_run_is_told_who_is_there_and_a_killed_one_holds_nothing(tmp_path: Path) -> None:
     holder = subprocess.Popen([sys.executable, "-c", HOLDER, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     try:
-        assert holder.stdout is not None
         assert holder.stdout.readline() == "held\n"
         with pytest.raises(RunInProgressError, match=f"another run is writing here \\(process {holder.pid} on "):
             RunLog(tmp_path).__enter__()
         log = read_log(tmp_path)
-        assert log is not None
         assert log[0].is_alive
     finally:
         holder.kill()
@@ -44,7 +42,6 @@ def test_a_second_run_is_told_who_is_there_and_a_killed_one_holds_nothing(tmp_pa
     with RunLog(tmp_path) as mine:
         mine.begin(RunBeginning({}, 3))
         now = read_log(tmp_path)
-        assert now is not None
         assert (now[0].pid, now[0].host) == (os.getpid(), platform.node())
 
 
@@ -132,5 +129,4 @@ def test_what_a_full_disk_took_of_a_line_is_taken_back(tmp_path: Path) -> None:
         log._file = file
         log.add(RunEvent(1.0, resumed=2))
     found = read_log(tmp_path)
-    assert found is not None
     assert [event.resumed for event in found[1]] == [2]

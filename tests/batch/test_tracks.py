@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.kitti_folder import FRAMES
-from helpers.layouts import write, write_sequence
+from helpers.layouts import write_sequence, write_tracked
 from helpers.output_folders import result_files
 from helpers.quick_runs import refiner
 
@@ -26,14 +26,7 @@ def sequence(shared_kitti: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     """The frames of the shared data set as a sequence, every car with the track of its line."""
     root = tmp_path_factory.mktemp("sequence")
     write_sequence(shared_kitti, root, FRAMES, single=True)
-    lines = [
-        f"{number} {track} {line}\n"
-        for number, frame_id in enumerate(FRAMES)
-        for track, line in enumerate(
-            (shared_kitti / "detections" / "data" / f"{frame_id}.txt").read_text().splitlines()
-        )
-    ]
-    write(root / "results" / f"{root.name}.txt", "".join(lines))
+    write_tracked(shared_kitti / "detections" / "data", FRAMES, root / "results" / f"{root.name}.txt")
     return root
 
 

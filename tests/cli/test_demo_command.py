@@ -22,7 +22,6 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [line for line in out.splitlines() if re.match(r"\d+ +[\d.]+ m ", line)]
     assert len(rows) == len(cars)
     overlap = re.search(r"mean .* (\d\.\d\d) -> +(\d\.\d\d)", out)
-    assert overlap is not None
     before, after = map(float, overlap.groups())
     assert after > before + 0.1
     assert (tmp_path / "overlays" / "000000.png").stat().st_size > 100_000

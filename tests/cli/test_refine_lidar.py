@@ -59,13 +59,11 @@ def test_scans_are_read_in_the_left_camera_and_batched(source: Path) -> None:
     dataset = open_dataset("kitti", source, source / "detections", source / "masks", lidar_dir=source / "velodyne")
     loaded = [dataset.load(frame_id) for frame_id in FRAMES]
     points = loaded[0].frame.points_cam
-    assert points is not None
     label = np.array((source / "training" / "label_2" / "000000.txt").read_text().split()[11:14], dtype=float)
     # The grid's middle, 0.8 m above the label's origin; the left camera stands beside camera 0 and sees all of it.
     middle = loaded[0].frame.camera.t_cam_ref[0].double().numpy() + label - [0, 0.8, 0]
     np.testing.assert_allclose(points[0].double().mean(dim=0).numpy(), middle, atol=1e-5)
     frames, _ = collate(loaded)
-    assert frames.points_cam is not None
     assert frames.points_cam.shape == (2, 64, 3)
 
 

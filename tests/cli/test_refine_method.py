@@ -71,7 +71,6 @@ def test_frames_of_several_sizes_keep_their_maps(source: Path) -> None:
     dataset = open_dataset("kitti", source, source / "detections", source / "masks", disparity_dir=source / "disparity")
     loaded = [dataset.load(frame_id) for frame_id in dataset.frame_ids]
     together = collate(loaded)[0].disparity
-    assert together is not None
     np.testing.assert_array_equal(together[1], loaded[1].frame.disparity[0])  # type: ignore[index]
     bare = open_dataset("kitti", source, source / "detections", source / "masks").load("000000")
     assert collate([bare])[0].disparity is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -50,14 +51,19 @@ def write_sequence(kitti: Path, root: Path, frame_ids: tuple[str, ...], single: 
             ending = "txt" if folder == "planes" else "png"
             target = base / folder if single else base / folder / SEQUENCE
             put(kitti / "training" / source / f"{frame_id}.{ending}", target / f"{number:06d}.{ending}")
-    labels = [
-        f"{number} {track} {line}\n"
-        for number, frame_id in enumerate(frame_ids)
-        for track, line in enumerate((kitti / "training" / "label_2" / f"{frame_id}.txt").read_text().splitlines())
-    ]
-    write(base / "label_02.txt" if single else base / "label_02" / f"{SEQUENCE}.txt", "".join(labels))
+    labels = base / "label_02.txt" if single else base / "label_02" / f"{SEQUENCE}.txt"
+    write_tracked(kitti / "training" / "label_2", frame_ids, labels)
     calibration = kitti / "training" / "calib" / f"{frame_ids[0]}.txt"
     put(calibration, base / "calib.txt" if single else base / "calib" / f"{SEQUENCE}.txt")
+
+
+def write_tracked(source: Path, frame_ids: tuple[str, ...], to: Path, tracks: Iterable[int] | None = None) -> None:
+    """One file of the frames of a folder, each object with the track of its line, by default its number."""
+    lines = [(source / f"{frame_id}.txt").read_text().splitlines() for frame_id in frame_ids]
+    ids = list(range(max(map(len, lines))) if tracks is None else tracks)
+    write(
+        to, "".join(f"{k} {t} {line}\n" for k, frame in enumerate(lines) for t, line in zip(ids, frame, strict=False))
+    )
 
 
 def write_stereo2015(kitti: Path, root: Path, frame_ids: tuple[str, ...]) -> None:

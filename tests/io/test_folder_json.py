@@ -107,9 +107,7 @@ def test_plane_and_labels(root: Path) -> None:
     write(root, "frames/a.json", {**FRAME, "ground_plane": [0, 2, 0, -3], "labels": [CAR]})
     files = folder_layout(root).files("a")
     plane, labels = files.read_plane(), files.read_labels()
-    assert plane is not None
     assert plane.tolist() == [0, -1, 0, 1.5]
-    assert labels is not None
     assert labels[0].score is None
     write(root, "frames/a.json", {**FRAME, "ground_plane": [1, 0, 0, -3]})
     with pytest.raises(DataFormatError, match=r"the normal is not near the vertical.*docs/inputs\.md"):

@@ -60,7 +60,6 @@ def test_frame_and_detections(root: Path) -> None:
     expected = torch.tensor([car.location_ref for car in cars]).double() + loaded.frame.camera.t_cam_ref[0]
     torch.testing.assert_close(loaded.detections.T_cam_obj[:, :3, 3], expected, atol=1e-6, rtol=0)
     assert loaded.detections.score.tolist() == [0.9, 0.8]
-    assert loaded.labels is not None
     assert loaded.labels[0].score is None
     assert dataset(root, classes=("Pedestrian",)).load("000000").refined_rows == (-1, 0, -1, -1)
 
@@ -113,7 +112,6 @@ def test_right_mask_of_a_hidden_car_is_found_by_way_of_the_left_one(root: Path) 
 def test_other_instances_are_occluders_with_the_depth_of_a_detection_of_their_class(root: Path) -> None:
     write_masks(root, [*read_masks(root), instance("left", WALKER_BOX, 7, category=1)])
     occluders = dataset(root).load("000000").detections.occluders
-    assert occluders is not None
     assert occluders.mask_left.shape == (1, 120, 160)
     assert occluders.mask_left[0, 30, 8] == 1
     assert occluders.mask_right.sum() == 0
@@ -122,7 +120,6 @@ def test_other_instances_are_occluders_with_the_depth_of_a_detection_of_their_cl
     path = root / "detections" / "data" / "000000.txt"
     path.write_text("".join(line for line in path.read_text().splitlines(keepends=True) if "Pedestrian" not in line))
     occluders = dataset(root).load("000000").detections.occluders
-    assert occluders is not None
     assert occluders.depth_m.isnan().all()
 
 
@@ -131,7 +128,6 @@ def test_left_over_car_mask_takes_its_depth_from_a_van(root: Path) -> None:
     path.write_text(path.read_text().replace("Car", "Van", 1))
     detections = dataset(root).load("000000").detections
     assert len(detections) == 1
-    assert detections.occluders is not None
     van = read_objects(path)[0].location_ref[2] + 0.003
     # In the left and in the right image.
     assert detections.occluders.depth_m.tolist() == pytest.approx([van, van])
@@ -230,7 +226,6 @@ def test_collate_pads_and_numbers(root: Path) -> None:
     assert detections.mask_left.shape == (4, 126, 170)
     assert torch.equal(detections.mask_left[:2, :120, :160], loaded[0].detections.mask_left)
     assert detections.has_mask_left.tolist() == [True, True, False, False]
-    assert detections.occluders is not None
     assert detections.occluders.frame_index.tolist() == [0]
 
 
@@ -240,7 +235,6 @@ def test_collate_keeps_standard_deviations_and_what_no_frame_knows_is_infinite(r
     sigma = torch.rand(count, 4) + 0.1
     known = replace(loaded, detections=replace(loaded.detections, pose_sigma=sigma))
     joined = collate([known, loaded])[1].pose_sigma
-    assert joined is not None
     assert torch.equal(joined, torch.cat([sigma, torch.full((count, 4), torch.inf)]))
     assert collate([loaded, loaded])[1].pose_sigma is None
 

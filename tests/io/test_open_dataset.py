@@ -20,6 +20,7 @@ from helpers.layouts import (
     write_raw,
     write_sequence,
     write_stereo2015,
+    write_tracked,
 )
 from helpers.matched_masks import instances
 
@@ -88,19 +89,13 @@ def test_one_tracking_sequence(kitti: Path, tmp_path: Path, expected: LoadedFram
     dataset = open_dataset("tracking", tmp_path, kitti / "detections", kitti / "masks", dtype=torch.float64)
     assert_same(dataset, "000001", expected)
     labels = dataset.load("000001").labels
-    assert labels is not None
-    assert [label.location_ref for label in labels] == [label.location_ref for label in expected.labels or []]
+    assert [label.location_ref for label in labels] == [label.location_ref for label in expected.labels]
 
 
 def test_tracking_benchmark_with_one_result_file_a_sequence(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
     write_sequence(kitti, tmp_path, FRAMES, single=False)
     _, masks = renamed(kitti, tmp_path, (f"{SEQUENCE}/000000", f"{SEQUENCE}/000001"))
-    lines = [
-        f"{number} 7 {line}"
-        for number, frame_id in enumerate(FRAMES)
-        for line in (kitti / "detections" / "data" / f"{frame_id}.txt").read_text().splitlines()
-    ]
-    write(tmp_path / "results" / f"{SEQUENCE}.txt", "\n".join(lines))
+    write_tracked(kitti / "detections" / "data", FRAMES, tmp_path / "results" / f"{SEQUENCE}.txt")
     dataset = open_dataset("tracking", tmp_path, tmp_path / "results", masks, dtype=torch.float64)
     assert dataset.frame_ids == (f"{SEQUENCE}_000000", f"{SEQUENCE}_000001")
     assert_same(dataset, f"{SEQUENCE}_000001", expected)

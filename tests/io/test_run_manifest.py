@@ -40,7 +40,6 @@ def test_round_trip_resumes(tmp_path: Path) -> None:
     assert read_manifest(path) is None
     write_manifest(path, manifest())
     previous = read_manifest(path)
-    assert previous is not None
     check_resume(previous, manifest())
     assert previous.failed == {"000002": "cut short"}
     assert previous.hash == manifest().hash != dataclasses.replace(manifest(), package_version="0.2.0").hash

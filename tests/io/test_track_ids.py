@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from helpers.layouts import SEQUENCE, write, write_folder, write_sequence
+from helpers.layouts import SEQUENCE, write, write_folder, write_sequence, write_tracked
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.read_files import Line
@@ -21,18 +20,11 @@ from directshape_torch.io.track_association import associate
 FRAMES = ("000000", "000001")
 
 
-def tracked_lines(kitti: Path, tracks: Sequence[int]) -> str:
-    """The detections of both frames, numbered."""
-    lines = [(kitti / "detections" / "data" / f"{name}.txt").read_text().splitlines() for name in FRAMES]
-    return "\n".join(f"{k} {t} {line}" for k, frame in enumerate(lines) for t, line in zip(tracks, frame, strict=True))
-
-
 def test_tracks_of_a_result_file_reach_the_detections(kitti: Path, tmp_path: Path) -> None:
     write_sequence(kitti, tmp_path, FRAMES, single=True)
-    write(tmp_path / "results" / f"{tmp_path.name}.txt", tracked_lines(kitti, (7, -1, 3)))
+    write_tracked(kitti / "detections" / "data", FRAMES, tmp_path / "results" / f"{tmp_path.name}.txt", (7, -1, 3))
     dataset = open_dataset("tracking", tmp_path, tmp_path / "results", kitti / "masks", tracks=True)
     _, detections = collate([dataset.load(frame_id) for frame_id in FRAMES])
-    assert detections.track_id is not None
     assert detections.track_id.tolist() == [7, 3, 7, 3]
     unasked = open_dataset("tracking", tmp_path, tmp_path / "results", kitti / "masks")
     assert unasked.load(FRAMES[0]).detections.track_id is None
@@ -42,8 +34,6 @@ def test_cars_without_numbers_are_associated(kitti: Path, tmp_path: Path) -> Non
     write_sequence(kitti, tmp_path, FRAMES, single=True)
     dataset = open_dataset("tracking", tmp_path, kitti / "detections", kitti / "masks", tracks=True)
     first, second = (dataset.load(frame_id).detections.track_id for frame_id in FRAMES)
-    assert first is not None
-    assert second is not None
     # Both frames show the same cars; the pedestrian's line lies between them.
     assert first.tolist() == second.tolist() == [0, 2]
 
@@ -58,7 +48,6 @@ def test_instances_of_mots_are_tracks(kitti: Path, tmp_path: Path) -> None:
         cv2.imwrite(str(path), ids.numpy().astype(np.uint16))
     dataset = open_dataset("tracking", tmp_path, kitti / "detections", tmp_path / "mots", tracks=True)
     track_id = dataset.load(FRAMES[1]).detections.track_id
-    assert track_id is not None
     assert track_id.tolist() == [8, 5]
 
 
@@ -68,7 +57,6 @@ def test_objects_of_a_folder_carry_their_track(kitti: Path, tmp_path: Path) -> N
     text = path.read_text()
     path.write_text(text.replace('"class": "Car"', '"track_id": 4, "class": "Car"', 1))
     track_id = open_dataset("folder", tmp_path, tracks=True).load(FRAMES[0]).detections.track_id
-    assert track_id is not None
     assert track_id.tolist() == [4, -1]
     path.write_text(text.replace('"class": "Car"', '"track_id": 4.5, "class": "Car"', 1))
     with pytest.raises(DataFormatError, match=r"objects\[0\].track_id: expected int, got 4\.5"):
@@ -77,11 +65,10 @@ def test_objects_of_a_folder_carry_their_track(kitti: Path, tmp_path: Path) -> N
 
 def test_tracks_of_two_sequences_are_different_cars(kitti: Path, tmp_path: Path) -> None:
     write_sequence(kitti, tmp_path, FRAMES, single=True)
-    write(tmp_path / "results" / f"{tmp_path.name}.txt", tracked_lines(kitti, (7, -1, 3)))
+    write_tracked(kitti / "detections" / "data", FRAMES, tmp_path / "results" / f"{tmp_path.name}.txt", (7, -1, 3))
     dataset = open_dataset("tracking", tmp_path, tmp_path / "results", kitti / "masks", tracks=True)
     first, second = (dataset.load(frame_id) for frame_id in FRAMES)
     _, detections = collate([replace(first, sequence="0001"), replace(second, sequence="0002")])
-    assert detections.track_id is not None
     assert len(set(detections.track_id.tolist())) == 4
 
 
