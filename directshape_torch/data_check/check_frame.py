@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -13,69 +14,79 @@ from numpy.typing import NDArray
 from directshape_torch.errors import DataFormatError, DirectShapeError
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_detections import match_masks
+from directshape_torch.io.frame_layout import FrameFiles
 from directshape_torch.io.image_files import as_pair, read_rgb
 from directshape_torch.io.instance_masks import InstanceMask, MaskSizeError
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.scene import SIDES
-from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence
+from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence, Pair
 from directshape_torch.scene_check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, check_images
 from directshape_torch.scene_check.finding import Finding, names, unreadable
 
 _Part = TypeVar("_Part")
+_CALIBRATION = "P2 and P3, 12 finite numbers each, or rig.json as in docs/inputs.md"
 
 
-def check_frame(dataset: StereoDataset, frame_id: str) -> tuple[list[Finding], int, FrameEvidence | None]:
-    """All findings about a frame, the number of its cars, and what it shows of them, None where its images or its
-    calibration are wrong."""
-    findings, where = list[Finding](), f"frame {frame_id}"
+class _Attempts:
+    """Reads the parts of a frame, and keeps what is found where one cannot be read."""
 
-    def attempt(check: str, expected: str, read: Callable[[], _Part]) -> _Part | None:
+    def __init__(self, where: str) -> None:
+        self.where, self.findings = where, list[Finding]()
+
+    def __call__(self, check: str, expected: str, read: Callable[[], _Part]) -> _Part | None:
         try:
             return read()
         except (DirectShapeError, OSError) as error:
             if isinstance(error, MaskSizeError):
                 check, expected = "mask_size", "masks of the size of their image"
-            found = unreadable(check, where, expected, error, "check the path and the file")
+            found = unreadable(check, self.where, expected, error, "check the path and the file")
             is_missing = isinstance(error, DataFormatError) and not error.path.exists()
             # That a file is missing is found for all frames at once, and one file may hold several parts.
-            if not is_missing and found.measured not in {finding.measured for finding in findings}:
-                findings.append(found)
+            if not is_missing and found.measured not in {finding.measured for finding in self.findings}:
+                self.findings.append(found)
             return None
 
-    files, source, pair, masks, camera, size_hw = dataset.layout.files(frame_id), dataset.masks, None, None, None, None
-    left = attempt("left_image", "a whole PNG or JPEG", lambda: read_rgb(files.left))
-    right = attempt("right_image", "a whole PNG or JPEG", lambda: read_rgb(files.right))
-    if left is not None and right is not None:
-        pair = attempt("image_size", "one size", lambda: as_pair(left, right, files.right))
-    calibrated = "P2 and P3, 12 finite numbers each, or rig.json as in docs/inputs.md"
-    calibration = attempt("calibration_file", calibrated, files.read_calibration)
-    if pair is not None and calibration is not None:
-        size_wh, of_calibration = (pair[0].shape[1], pair[0].shape[0]), "the size that the calibration is of"
-        if attempt("image_size", of_calibration, lambda: calibration.of_size(size_wh)) is None:
-            pair = None  # what rests on both would only say the same again
+
+def check_frame(dataset: StereoDataset, frame_id: str) -> tuple[list[Finding], int, FrameEvidence | None]:
+    """All findings about a frame, the number of its cars, and what it shows of them, None where its images or its
+    calibration are wrong."""
+    files, attempt = dataset.layout.files(frame_id), _Attempts(f"frame {frame_id}")
+    pair, calibration = _read_pair(files, attempt), attempt("calibration_file", _CALIBRATION, files.read_calibration)
+    size_hw = None if pair is None else (pair[0].shape[0], pair[0].shape[1])
+    if size_hw is not None and calibration is not None:
+        same_size = partial(calibration.of_size, size_hw[::-1])
+        if attempt("image_size", "the size that the calibration is of", same_size) is None:
+            pair = size_hw = None  # what rests on both would only say the same again
     objects = attempt("detection_file", "lines of 15 or 16 columns, or JSON as in docs/inputs.md", files.read_objects)
-    if pair is not None:
-        height, width = pair[0].shape[:2]
-        size_hw = height, width
-        if source is not None:
-            masks = attempt("mask_file", "masks of both images", lambda: source.read(frame_id, (height, width)))
+    masks = None
+    if size_hw is not None and dataset.masks is not None:
+        masks = attempt("mask_file", "masks of both images", partial(dataset.masks.read, frame_id, size_hw))
     attempt("plane_file", "a x + b y + c z + d = 0 with |b| near 1", files.read_plane)
+    findings, camera = attempt.findings, None
     if calibration is not None:
-        findings += check_calibration(*numbers_of(calibration), size_hw, where)
+        findings += check_calibration(*numbers_of(calibration), size_hw, attempt.where)
         # One that is no stereo pair's has been found by that. A singular matrix is a RuntimeError.
         with suppress(DirectShapeError, RuntimeError):
             camera = to_stereo_camera(calibration)
     # A wrong calibration must not spoil what the images say by themselves.
     camera = None if names(findings) & SPOILS_CAMERA else camera
     if pair is not None:
-        findings += check_images(*pair, camera, where)
+        findings += check_images(*pair, camera, attempt.where)
     cars = [o for o in objects or [] if o.type in dataset.classes and o.has_box_3d]
     if camera is None or size_hw is None:
         return findings, len(cars), None
     evidence = _evidence(frame_id, cars, masks, camera, size_hw)
     return findings, len(cars), replace(evidence, pair=None if names(findings) & SPOILS_PAIR else pair)
+
+
+def _read_pair(files: FrameFiles, attempt: _Attempts) -> Pair | None:
+    sides = {"left_image": files.left, "right_image": files.right}
+    left, right = (attempt(check, "a whole PNG or JPEG", partial(read_rgb, path)) for check, path in sides.items())
+    if left is None or right is None:
+        return None
+    return attempt("image_size", "one size", partial(as_pair, left, right, files.right))
 
 
 def numbers_of(calibration: KittiCalibration) -> tuple[dict[str, NDArray[np.float64]], float]:
