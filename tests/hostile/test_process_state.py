@@ -71,11 +71,6 @@ def data_options(root: Path) -> list[str]:
     return ["--data", str(root), "--detections", str(root / "detections"), "--masks", str(root / "masks")]
 
 
-def refine_command(root: Path, out: Path) -> None:
-    prior = ["--prior", str(root / "prior.safetensors"), "--set", "solver.max_code=2"]
-    main(["refine", *data_options(root), "--out", str(out / "out"), *prior, "--frames", "000000"])
-
-
 def failing_command(root: Path, out: Path) -> None:
     assert main(["refine", *data_options(root), "--out", str(out / "out"), "--prior", str(out)]) == 2
 
@@ -91,10 +86,6 @@ def priors(_: Path, out: Path) -> None:
         path = out / ("a.npz" if name == "pca" else "a.safetensors")
         prior.save(path)  # type: ignore[attr-defined]
         load_prior(path)
-
-
-def check_data(root: Path, _: Path) -> None:
-    main(["check-data", *data_options(root), "--frames", "000000"])
 
 
 def write(_: Path, out: Path) -> None:
@@ -127,6 +118,8 @@ def commands(root: Path, out: Path) -> None:
     data, labels, results = data_options(root), str(root / "training" / "label_2"), str(out / "out" / "data")
     with_prior = [*data, "--prior", str(root / "prior.safetensors")]
     for command in (
+        ["refine", *with_prior, "--out", str(out / "refined"), "--set", "solver.max_code=2", "--frames", "000000"],
+        ["check-data", *data, "--frames", "000000"],
         ["status", str(out / "out")],
         ["report", str(out / "out"), "--html", str(out / "page.html"), *with_prior],
         ["export", str(out / "out"), "--out", str(out / "exports"), "--format", "glb", "kitti", *with_prior],
@@ -140,10 +133,7 @@ def commands(root: Path, out: Path) -> None:
         main(["no-such-command"])
 
 
-CALLS = (
-    *(forward, gradient, tensors, run, refine_command, failing_command, failing_run, priors, check_data, commands),
-    write,
-)
+CALLS = (forward, gradient, tensors, failing_command, failing_run, priors, commands, write)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks /proc")
