@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
-from typing import Protocol, Self
+from typing import Self
 
 from directshape_torch.batch.frame_groups import FrameGroup
 from directshape_torch.batch.frame_outputs import failed_entry
@@ -28,19 +28,8 @@ _DEATH = "killed, out of memory or crashed"
 _PIPE_ENDED = (EOFError, ConnectionError)
 
 
-class Workers(Protocol):
-    """Refine groups of frames, `capacity` at once; of a group whose worker died there is no report."""
-
-    @property
-    def capacity(self) -> int: ...
-
-    def hand_out(self, group: FrameGroup) -> None: ...
-
-    def next_reports(self) -> list[tuple[FrameGroup, GroupReport | None]]: ...
-
-
 def reports_of(
-    workers: Workers, groups: Sequence[FrameGroup], retries: int, entry_of: Callable[[str], FrameEntry | None]
+    workers: LocalWorkers, groups: Sequence[FrameGroup], retries: int, entry_of: Callable[[str], FrameEntry | None]
 ) -> Iterator[GroupReport]:
     """What became of the groups of a run, in the order in which they end.
 
@@ -124,7 +113,7 @@ class LocalWorkers:
             worker.pipe.send(group)
 
     def next_reports(self) -> list[tuple[FrameGroup, GroupReport | None]]:
-        """Wait for any process.
+        """Wait for any process; of a group whose worker died there is no report.
 
         Raises:
             DirectShapeError: a worker cannot read the job.

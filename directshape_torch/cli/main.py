@@ -10,9 +10,11 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 
 from directshape_torch.batch.refine_dataset import package_version
 from directshape_torch.errors import DirectShapeError
+from directshape_torch.files.atomic_files import check_file
 
 EXIT_WRONG_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -55,6 +57,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.print_help(sys.stderr)
         return EXIT_WRONG_INPUT
     try:
+        # Before any work: a page or table that cannot be written afterwards.
+        for name in ("html", "json", "csv"):
+            if isinstance(path := getattr(args, name, None), Path) and str(path) != "-":
+                check_file(f"--{name}", path)
         with _terminable():
             code: int = args.run(args)
         sys.stdout.flush()

@@ -14,7 +14,7 @@ from directshape_torch.batch.run_log import read_log
 from directshape_torch.batch.run_status import read_status
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.comparison import WORSE_BY_BEV_IOU
-from directshape_torch.files.atomic_files import check_file, replaced_file
+from directshape_torch.files.atomic_files import replaced_file
 from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.run_manifest import flatten, hash_fields
@@ -57,7 +57,6 @@ def make_report(
     """
     if most_frames < 0:
         raise InputError("most_frames", "0 or more", str(most_frames))
-    check_file("page", page)
     run, mean, config = inputs.run, inputs.mean, inputs.run.refiner_config()
     rows: list[CarRow] = []
     grounds: Counter[str] = Counter()

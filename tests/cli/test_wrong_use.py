@@ -68,7 +68,12 @@ CASES = [
         )
     ),
     ("calibrate-rig --data {root} --out {root}", "--out: expected a file, got the folder"),
-    ("report {run} --html {root}", "page: expected a file, got the folder"),
+    (
+        "check-data --data {root} --detections {root}/detections --json {root}",
+        "--json: expected a file, got the folder",
+    ),
+    (f"evaluate --labels {{root}} --results {{root}} --json {FILE}/a.json", "--json: expected a folder, which is made"),
+    ("report {run} --html {root}", "--html: expected a file, got the folder"),
     (f"{MASKED} --prior pcaa", "directshape build-prior; bundled ones are pca and neural"),
     (f"{MASKED} --threads 0", "threads: expected at least 1, got 0"),
     (f"{MASKED} --lidar nowhere", "nowhere: is no folder of LiDAR scans"),

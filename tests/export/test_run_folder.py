@@ -34,11 +34,6 @@ def test_the_centre_is_half_a_height_above_the_bottom(finished: FinishedRun) -> 
     np.testing.assert_allclose(pedestrian.R_ref_obj[:, 0], [np.cos(0.1), 0, -np.sin(0.1)], atol=1e-12)
 
 
-@pytest.mark.parametrize("wanted", [["000001"], ["1"], [1], ["000001", 1, "1"]])
-def test_frames_are_named_in_any_way(finished: FinishedRun, wanted: list[str | int]) -> None:
-    assert RunFolder(finished.out, wanted).frame_ids == ("000001",)
-
-
 def test_files_that_do_not_fit_together_are_named(finished: FinishedRun, tmp_path: Path) -> None:
     out = Path(shutil.copytree(finished.out, tmp_path / "out"))
     result = out / "data" / "000000.txt"
