@@ -1,4 +1,4 @@
-"""From a stereo rig of one's own to the plain folder that `directshape --layout folder` reads (docs/inputs.md).
+"""From a stereo rig of one's own to the plain folder that `directshape --layout folder` reads (docs/plain_folder.md).
 
     python examples/convert_to_folder.py --rig mine --out folder
     directshape check-data --layout folder --data folder

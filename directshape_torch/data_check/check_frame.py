@@ -26,7 +26,7 @@ from directshape_torch.scene_check.check_images import SPOILS_CAMERA, SPOILS_PAI
 from directshape_torch.scene_check.finding import Finding, names, unreadable
 
 _Part = TypeVar("_Part")
-_CALIBRATION = "P2 and P3, 12 finite numbers each, or rig.json as in docs/inputs.md"
+_CALIBRATION = "P2 and P3, 12 finite numbers each, or rig.json as in docs/plain_folder.md"
 
 
 class _Attempts:
@@ -59,7 +59,9 @@ def check_frame(dataset: StereoDataset, frame_id: str) -> tuple[list[Finding], i
         same_size = partial(calibration.of_size, size_hw[::-1])
         if attempt("image_size", "the size that the calibration is of", same_size) is None:
             pair = size_hw = None  # what rests on both would only say the same again
-    objects = attempt("detection_file", "lines of 15 or 16 columns, or JSON as in docs/inputs.md", files.read_objects)
+    objects = attempt(
+        "detection_file", "lines of 15 or 16 columns, or JSON as in docs/plain_folder.md", files.read_objects
+    )
     masks = None
     if size_hw is not None and dataset.masks is not None:
         masks = attempt("mask_file", "masks of both images", partial(dataset.masks.read, frame_id, size_hw))

@@ -1,4 +1,4 @@
-"""The JSON files of a plain folder for a stereo rig of one's own: `rig.json`, and one a frame (docs/inputs.md).
+"""The JSON files of a plain folder for a stereo rig of one's own: `rig.json`, and one a frame (docs/plain_folder.md).
 
 The frame of boxes and planes is the left camera's: `ref` is `cam`.
 """
@@ -31,7 +31,7 @@ from directshape_torch.numerics.checks import is_no_rotation
 from directshape_torch.scene import SIDES, Side
 
 FOLDER_SCHEMA_VERSION = 1
-_CURE = "see docs/inputs.md"
+_CURE = "see docs/plain_folder.md"
 _Triple = tuple[float, float, float]
 _Row = tuple[float, float, float, float]
 _CAR = "Car"

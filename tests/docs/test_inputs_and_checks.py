@@ -15,6 +15,7 @@ from directshape_torch.scene_check.finding import MISTAKES
 
 ROOT = Path(__file__).parents[2]
 INPUTS = (ROOT / "docs" / "inputs.md").read_text(encoding="utf-8")
+FOLDER = (ROOT / "docs" / "plain_folder.md").read_text(encoding="utf-8")
 CHECKS = (ROOT / "docs" / "check_data.md").read_text(encoding="utf-8")
 
 
@@ -25,18 +26,18 @@ def first_column(text: str) -> set[str]:
 
 
 def test_every_layout_is_in_the_table() -> None:
-    assert first_column(INPUTS.split("## A plain folder")[0]) == set(get_args(LayoutName))
+    assert first_column(INPUTS) == set(get_args(LayoutName))
 
 
 def test_keys_of_the_folder() -> None:
-    documented = first_column(INPUTS.split("## A plain folder")[1])
+    documented = first_column(FOLDER)
     kinds = (folder_files.FolderRig, folder_files.FolderFrame, folder_files.FolderObject)
     keys = {field.name.replace("object_class", "class") for kind in kinds for field in fields(kind)}
     assert documented == keys - {"comment"} | {"schema_version"}
 
 
 def test_the_smallest_frame_is_one(tmp_path: Path) -> None:
-    (example,) = re.findall(r"```json\n(.*?)```", INPUTS, flags=re.DOTALL)
+    (example,) = re.findall(r"```json\n(.*?)```", FOLDER, flags=re.DOTALL)
     path = tmp_path / "000000.json"
     path.write_text(json.dumps(json.loads(example)))
     (car,) = folder_files.read_frame(path).objects

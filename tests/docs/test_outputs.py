@@ -1,4 +1,4 @@
-"""docs/outputs.md: its names are those of the code, and its Python runs."""
+"""docs/outputs.md and docs/exports.md: their names are those of the code, and their Python runs."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from directshape_torch.visualize.refinement_trace import RefinementTrace
 
 DOCS = Path(__file__).parents[2] / "docs"
 TEXT = (DOCS / "outputs.md").read_text(encoding="utf-8")
+EXPORTS = (DOCS / "exports.md").read_text(encoding="utf-8")
 
 
 def test_pictures_are_small() -> None:
@@ -42,7 +43,7 @@ def test_every_format_has_a_row() -> None:
 
 
 def test_names_are_those_of_the_code() -> None:
-    flat = " ".join(TEXT.split())
+    flat = " ".join(EXPORTS.split())
     numbered = ", ".join(f"{number} {name.lower()}" for number, name in enumerate(KITTI_TYPES, start=1))
     assert f"Categories: {numbered}." in flat
     assert f"sRGB {NEUTRAL_RGB}" in flat
@@ -51,7 +52,7 @@ def test_names_are_those_of_the_code() -> None:
 
 
 def test_the_python_example_runs(finished: FinishedRun, tmp_path: Path) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", TEXT[TEXT.index("## Export from Python") :], re.DOTALL)
+    (code,) = re.findall(r"```python\n(.*?)```", EXPORTS, re.DOTALL)
     places = {
         '"OUT"': finished.out,
         '"pca"': finished.root / "prior.safetensors",
