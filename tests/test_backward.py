@@ -17,8 +17,6 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.solver.differentiate import StartNotReachedWarning
 
-MODES = ("unroll", "implicit", "implicit_gauss_newton")
-
 
 @pytest.fixture(scope="module")
 def inputs() -> StreetInputs:
@@ -123,7 +121,7 @@ def test_cars_that_fail_pass_their_input_through_and_leave_the_others_alone(
     assert by_mask.isfinite().all()
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", ["unroll", "implicit"])
 def test_a_nan_image_gives_no_nan_gradient(inputs: StreetInputs, mode: str) -> None:
     frames, detections = _two_frames(inputs)
     images = frames.images_left.clone()
@@ -137,7 +135,7 @@ def test_a_nan_image_gives_no_nan_gradient(inputs: StreetInputs, mode: str) -> N
     assert gradient[detections.frame_index == 0].abs().max() > 0
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", ["unroll", "implicit"])
 def test_a_nan_pixel_that_nobody_needs_gives_no_nan_gradient(inputs: StreetInputs, mode: str) -> None:
     """As in rectified images whose borders have no values."""
     frames, detections = inputs.scene.frames, replace(inputs.detections, mask_left=inputs.mask)

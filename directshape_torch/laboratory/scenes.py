@@ -11,8 +11,7 @@ from torch import Tensor
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import box_corners
-from directshape_torch.geometry.camera import rays_from_pixels, right_rays
-from directshape_torch.geometry.projection import project
+from directshape_torch.geometry.projection import project, rays_from_pixels, right_rays
 from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.rows import Rays, Rows
 from directshape_torch.scene import Detections, FrameBatch

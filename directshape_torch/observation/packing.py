@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import SamplingConfig, SamplingMode
-from directshape_torch.geometry.camera import rays_from_pixels, right_rays
+from directshape_torch.geometry.projection import rays_from_pixels, right_rays
 from directshape_torch.image.grey_levels import gradient_magnitude_at, gradient_magnitude_of_part
 from directshape_torch.observation.extents import SceneExtents, region_boxes, scene_extents
 from directshape_torch.observation.occlusion import occlusion_map

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.geometry.box3d import box_corners
-from directshape_torch.geometry.camera import rays_from_pixels
-from directshape_torch.geometry.projection import project
+from directshape_torch.geometry.projection import project, rays_from_pixels
 from directshape_torch.geometry.se3 import inverse, transform
 from directshape_torch.rig.rig import Rig
 from directshape_torch.rows import ObjectRays

@@ -18,9 +18,8 @@ from kornia.geometry.liegroup import So3
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.geometry.camera import rays_from_pixels
 from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, polynomial_basis
-from directshape_torch.geometry.projection import project
+from directshape_torch.geometry.projection import project, rays_from_pixels
 from directshape_torch.geometry.se3 import exp, from_rotation_translation, transform
 from directshape_torch.rig.rig import Rig
 from directshape_torch.rig.self_calibration import PATCH_SIGMA_PX, FieldConstraint

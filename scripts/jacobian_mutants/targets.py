@@ -132,14 +132,9 @@ TARGETS: dict[str, Target] = {
     ),
     "retract": Target("directshape_torch/terms/cars.py", ("retract",), _JACOBIANS),
     "offset": Target("directshape_torch/terms/cars.py", ("CarBatch.inverse_depth_of_offset",), _OFFSET),
-    "rays": Target(
-        "directshape_torch/geometry/camera.py",
-        ("rays_from_pixels", "right_rays"),
-        ("tests/geometry/test_stereo.py",),
-    ),
     "projection": Target(
         "directshape_torch/geometry/projection.py",
-        ("project", "warp_to_right"),
+        ("rays_from_pixels", "project", "warp_to_right", "right_rays"),
         ("tests/geometry/test_stereo.py",),
     ),
     "bilinear": Target(

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.geometry.camera import rays_from_pixels
 from directshape_torch.geometry.disparity_field import DisparityField, polynomial_basis
-from directshape_torch.geometry.projection import disparity_of_depth, project
+from directshape_torch.geometry.projection import disparity_of_depth, project, rays_from_pixels
 from directshape_torch.geometry.se3 import exp
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.rig.estimate import RigEstimate

@@ -11,7 +11,7 @@ from helpers.synthetic_scene import TWO_CARS, disturbed, street
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.geometry.camera import rays_from_pixels
+from directshape_torch.geometry.projection import rays_from_pixels
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import FrameBatch
 from directshape_torch.terms.lidar import LidarPoints, lidar_points
