@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +16,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.projection import depth_from_disparity, rays_from_pixels
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_detections import match_masks
-from directshape_torch.io.image_files import read_disparity, read_single_channel
+from directshape_torch.io.image_files import read_disparity
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.refinement.ray_cast import cast
@@ -174,7 +173,8 @@ def segments_of(
     Raises:
         DataFormatError: the map or the masks are missing or damaged.
     """
-    depth = read_depth(path) if path.parent.name == "depth_2" else _depth_of(read_disparity(path), camera)
+    stored = read_disparity(path).astype(np.float64)
+    depth = stored if path.parent.name == "depth_2" else _depth_of(stored, camera)
     found = [mask for mask in masks.read(path.stem, depth.shape) if mask.side == "left"]
     boxes = np.array([label.box_2d for label in labels], dtype=np.float64).reshape(-1, 4)
     truths: dict[int, SegmentTruth] = {}
@@ -200,18 +200,9 @@ def segment_truth(
     return SegmentTruth(name, uv, depth_m[v, u, None] * rays_cam, K_left)
 
 
-def read_depth(path: Path) -> NDArray[np.float64]:
-    """A map of 16 bits, metres times 256, as (H, W) metres, NaN where it is 0."""
-    values = read_single_channel(path)
-    if values.dtype != np.uint16:
-        raise DataFormatError(path, f"expected 16 bits (metres times 256), got {values.dtype}")
-    return np.where(values > 0, values / 256.0, np.nan)
-
-
-def _depth_of(disparity: NDArray[np.floating[Any]], camera: StereoCamera) -> NDArray[np.float64]:
+def _depth_of(disparity: NDArray[np.float64], camera: StereoCamera) -> NDArray[np.float64]:
     """Metres; the residual disparity field of a rig plays no part: it corrects what a pair measures, not the truth."""
     height, width = disparity.shape
     uv = torch.from_numpy(np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64))
     K_left, K_right, T_right_cam = (x[0].double() for x in (camera.K_left, camera.K_right, camera.T_right_cam))
-    known = np.where(disparity > 0, disparity, np.nan).astype(np.float64)
-    return depth_from_disparity(uv, torch.from_numpy(known), K_left, K_right, T_right_cam).numpy()
+    return depth_from_disparity(uv, torch.from_numpy(disparity), K_left, K_right, T_right_cam).numpy()

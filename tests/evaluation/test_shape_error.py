@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from helpers.synthetic_scene import stereo_camera
@@ -11,9 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.evaluation.shape_error import TAUS_M, read_depth, segment_truth, shape_error
-from directshape_torch.files.atomic_files import write_png
+from directshape_torch.errors import InputError
+from directshape_torch.evaluation.shape_error import TAUS_M, segment_truth, shape_error
 
 
 def test_completeness_and_accuracy_are_told_apart() -> None:
@@ -83,11 +80,3 @@ def test_points_of_a_segment_are_those_of_its_known_depths() -> None:
     assert truth.points_cam[:, 2].tolist() == [8.0, 10.0]
     again = truth.points_cam @ camera.K_left[0].numpy().T
     np.testing.assert_allclose(again[:, :2] / again[:, 2:], truth.uv_left)
-
-
-def test_maps_of_depth(tmp_path: Path) -> None:
-    write_png(tmp_path / "a.png", np.array([[0, 128, 2560]], dtype=np.uint16))
-    np.testing.assert_array_equal(read_depth(tmp_path / "a.png"), [[np.nan, 0.5, 10.0]])
-    write_png(tmp_path / "b.png", np.zeros((2, 2), dtype=np.uint8))
-    with pytest.raises(DataFormatError, match="expected 16 bits"):
-        read_depth(tmp_path / "b.png")

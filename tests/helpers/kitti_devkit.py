@@ -1,13 +1,16 @@
 """KITTI's evaluation as its C++ devkit (2017) does it: one frame, one label, one detection after the other.
 
-The slow and readable reference for the vectorised evaluation; boxes in space must not be turned (rotation_y = 0).
+The slow and readable reference for the vectorised evaluation.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import cache
 
+from directshape_torch.evaluation.pose_error import boxes_of
+from directshape_torch.evaluation.rotated_iou import bev_boxes, bev_iou, iou_3d
 from directshape_torch.io.kitti_labels import KittiObject
 
 Frame = tuple[Sequence[KittiObject], Sequence[KittiObject]]  # labels, detections
@@ -17,47 +20,18 @@ MAX_TRUNCATION = {"easy": 0.15, "moderate": 0.3, "hard": 0.5}
 NEIGHBOUR = {"Car": "Van", "Pedestrian": "Person_sitting"}
 
 
-def overlap_2d(a: KittiObject, b: KittiObject, over_first: bool = False) -> float:
+@cache
+def overlap(metric: str, a: KittiObject, b: KittiObject, over_first: bool = False) -> float:
+    """Of image boxes as the devkit has it; that of boxes in space is held against OpenCV in `test_rotated_iou`."""
+    if metric != "2d":
+        boxes, others = boxes_of([a]), boxes_of([b])
+        return float(iou_3d(boxes, others) if metric == "3d" else bev_iou(bev_boxes(boxes), bev_boxes(others)))
     (a1, a2, a3, a4), (b1, b2, b3, b4) = a.box_2d, b.box_2d
     width, height = min(a3, b3) - max(a1, b1), min(a4, b4) - max(a2, b2)
     if width <= 0 or height <= 0:
         return 0.0
     area_a, area_b = (a3 - a1) * (a4 - a2), (b3 - b1) * (b4 - b2)
     return width * height / (area_a if over_first else area_a + area_b - width * height)
-
-
-def overlap_bev(a: KittiObject, b: KittiObject, over_first: bool = False) -> float:
-    shared = _shared_footprint(a, b)
-    area_a, area_b = a.hwl[1] * a.hwl[2], b.hwl[1] * b.hwl[2]
-    return shared / (area_a if over_first else area_a + area_b - shared)
-
-
-def overlap_3d(a: KittiObject, b: KittiObject, over_first: bool = False) -> float:
-    low, high = (
-        max(a.location_ref[1] - a.hwl[0], b.location_ref[1] - b.hwl[0]),
-        min(a.location_ref[1], b.location_ref[1]),
-    )
-    shared = _shared_footprint(a, b) * max(0.0, high - low)
-    volume_a, volume_b = math.prod(a.hwl), math.prod(b.hwl)
-    return shared / (volume_a if over_first else volume_a + volume_b - shared)
-
-
-def _shared_footprint(a: KittiObject, b: KittiObject) -> float:
-    """Length lies along x, width along z."""
-    assert a.rotation_y == 0
-    assert b.rotation_y == 0
-    if min(*a.hwl, *b.hwl) < 0:
-        return 0.0
-    along_x = min(a.location_ref[0] + a.hwl[2] / 2, b.location_ref[0] + b.hwl[2] / 2) - max(
-        a.location_ref[0] - a.hwl[2] / 2, b.location_ref[0] - b.hwl[2] / 2
-    )
-    along_z = min(a.location_ref[2] + a.hwl[1] / 2, b.location_ref[2] + b.hwl[1] / 2) - max(
-        a.location_ref[2] - a.hwl[1] / 2, b.location_ref[2] - b.hwl[1] / 2
-    )
-    return max(0.0, along_x) * max(0.0, along_z)
-
-
-OVERLAPS: dict[str, Callable[..., float]] = {"2d": overlap_2d, "bev": overlap_bev, "3d": overlap_3d}
 
 
 def devkit_curves(
@@ -118,7 +92,6 @@ def _statistics(
 ) -> tuple[list[float], int, float]:
     """Scores of right detections, number of wrong ones, and orientation similarity; no threshold: the first pass."""
     labels, detections = frame
-    overlap = OVERLAPS[metric]
     assigned = [False] * len(detections)
     low = [threshold is not None and float(d.score or 0) < threshold for d in detections]
     scores, similarity = [], 0.0
@@ -129,7 +102,7 @@ def _statistics(
         for j, detection in enumerate(detections):
             if ignored_detection[j] == -1 or assigned[j] or low[j]:
                 continue
-            value, score = overlap(detection, label), float(detection.score or 0)
+            value, score = overlap(metric, detection, label), float(detection.score or 0)
             if value <= minimum_iou:
                 continue
             if threshold is None:
@@ -147,7 +120,9 @@ def _statistics(
             similarity += (1 + math.cos(label.alpha - detections[best].alpha)) / 2
     wrong = [j for j in range(len(detections)) if not assigned[j] and not low[j] and ignored_detection[j] == 0]
     regions = [label for label in labels if label.type == "DontCare"]
-    in_region = [j for j in wrong if any(overlap(detections[j], region, True) > minimum_iou for region in regions)]
+    in_region = [
+        j for j in wrong if any(overlap(metric, detections[j], region, True) > minimum_iou for region in regions)
+    ]
     return scores, len(wrong) - len(in_region), similarity
 
 
