@@ -1,4 +1,4 @@
-"""The data behind the figures of a car against the refinement itself and against geometry by hand."""
+"""The data behind the figures of a car and its maps of residuals: the energy's own values, in the right places."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ import torch
 from directshape_torch.cli.demo import demo_dataset
 from directshape_torch.errors import InputError
 from directshape_torch.io.config_files import load_config
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.visualize.car_figures import CarCourse, iteration_frames, sampled_pixels_of
 from directshape_torch.visualize.drawing import BLUE, ORANGE, View, silhouette_mask
 from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
+from directshape_torch.visualize.residuals import CarResiduals, PixelResiduals, draw_residuals, residual_maps
 
 _CAR = 1
 
@@ -111,3 +113,56 @@ def test_cars_that_did_not_take_part_are_refused(course: CarCourse) -> None:
         CarCourse(course.loaded, trace, _CAR)
     with pytest.raises(InputError, match="no such car"):
         CarCourse(course.loaded, trace, 99)
+
+
+def at_the_end(
+    course: CarCourse, loaded: LoadedFrame, shift_m: tuple[float, float, float] = (0, 0, 0), *words: str
+) -> CarResiduals:
+    """The map of residuals that a page shows, of the car where its refinement ended, or moved away from there."""
+    result, rows = course.trace.result, torch.tensor([0, _CAR])
+    T_cam_obj = result.T_cam_obj[rows].numpy().copy()
+    T_cam_obj[:, :3, 3] += shift_m
+    states = [(T_cam_obj, result.code[rows].numpy())]
+    return residual_maps(loaded, result.prior, load_config("fast", list(words)), rows, states)[0][1]
+
+
+def mean(values: PixelResiduals) -> float:
+    return float(np.abs(values.value[~values.lost]).mean())
+
+
+def test_values_are_those_of_the_energy(course: CarCourse) -> None:
+    of_energy = course.trace.residuals(len(course.trace) - 1)[_CAR].silhouette_left
+    of_map = at_the_end(course, course.loaded).silhouette_left
+    known = dict(zip(map(tuple, of_map.uv.tolist()), of_map.value, strict=True))
+    energy = zip(map(tuple, of_energy.uv.tolist()), of_energy.value, strict=True)
+    pairs = [(value, known[place]) for place, value in energy if place in known]
+    assert len(pairs) > 30
+    np.testing.assert_allclose(*np.transpose(pairs), atol=1e-3)
+
+
+def test_a_car_in_the_wrong_place_disagrees(course: CarCourse) -> None:
+    found, behind = (at_the_end(course, course.loaded, (0, 0, metres)) for metres in (0.0, 1.0))
+    assert mean(behind.photometric) > 1.4 * mean(found.photometric)
+    # Moved to the right it leaves its mask's left side empty and spills out on the right.
+    left = at_the_end(course, course.loaded, (0.6, 0, 0)).silhouette_left
+    spilled, unfilled = np.clip(left.value, 0, None), np.clip(-left.value, 0, None)
+    assert np.average(left.uv[:, 0], weights=unfilled) + 20 < np.average(left.uv[:, 0], weights=spilled)
+
+
+def test_brightness_is_matched_where_the_run_matched_it(course: CarCourse) -> None:
+    frame = course.loaded.frame
+    dark = replace(course.loaded, frame=replace(frame, images_right=0.8 * frame.images_right))
+    matched, plain = (
+        mean(at_the_end(course, dark, (0, 0, 0), *words).photometric) for words in ([], ["photometric.brightness=none"])
+    )
+    assert plain > 2 * matched
+
+
+def test_without_a_mask_there_are_none(course: CarCourse) -> None:
+    detections = course.loaded.detections
+    none = torch.zeros_like(detections.has_mask_left)
+    found = at_the_end(course, replace(course.loaded, detections=replace(detections, has_mask_left=none)))
+    assert [len(values.uv) for values in found[::2]] == [0, 0]
+    view = View.of_frame(course.loaded.frame)
+    draw_residuals(view, found, "photometric")
+    assert (np.ptp(view.picture.astype(int), axis=2) == 0).all()
