@@ -77,6 +77,18 @@ def test_meshes_and_boxes_stand_where_the_points_are() -> None:
         assert mesh.is_watertight
 
 
+def test_standard_deviations_are_in_the_frame_of_the_points_and_no_mask_is_judged() -> None:
+    points, _ = cars(True)
+    quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    boxes = TRUE_BOXES + ERRORS
+    turned = torch.cat([boxes[:, :3] @ quarter.T, boxes[:, 3:6], boxes[:, 6:] + torch.pi / 2], dim=1)
+    one = fit_shape(points, boxes, "mmdet3d_lidar", PRIOR).cars
+    other = fit_shape(points @ quarter.T, turned, "mmdet3d_lidar", PRIOR).cars
+    expected = quarter @ one.covariance_xyz_yaw[:, :3, :3] @ quarter.T
+    torch.testing.assert_close(other.covariance_xyz_yaw[:, :3, :3], expected, atol=1e-9, rtol=1e-4)
+    assert one.quality.mask_iou_left.isnan().all()
+
+
 def test_a_car_without_points_keeps_its_box_and_touches_no_other() -> None:
     points, _ = cars(False)
     alone = fit_shape(points, (TRUE_BOXES + ERRORS)[:1], "mmdet3d_lidar", PRIOR)

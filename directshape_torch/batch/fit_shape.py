@@ -39,7 +39,8 @@ class ShapeFit:
 
     Attributes:
         cars: poses, codes, boxes and meshes; what is called `cam` there is the frame of the points. The status is
-            `too_few_points` for cars with fewer than 30.
+            `too_few_points` for cars with fewer than 30. Figures of masks are NaN, and standard deviations relative:
+            they are calibrated for images.
         num_points: (N,) points of each car.
         distance_before_m, distance_after_m: (N,) mean distance of these points to the surface of the mean car in the
             given box, and to the fitted one; NaN where there are none.
@@ -98,9 +99,15 @@ def fit_shape(
         fitted = _without_points_unknown(fitter(frames, detections), samples.counts, T_cam_obj)
         before = replace(fitted, T_cam_obj=T_cam_obj, code=fitter.prior.initial_code(len(boxes)).to(boxes))
         distances = [_distances(samples, cars) for cars in (before, fitted)]
-    T_fitted = se3.inverse(T_cam_points) @ fitted.T_cam_obj
-    kept = torch.where(fitted.refined[:, None, None], T_fitted, T_points_obj)
-    return ShapeFit(replace(fitted, T_cam_obj=kept), samples.counts, *distances)
+    T_points_cam = se3.inverse(T_cam_points)
+    kept = torch.where(fitted.refined[:, None, None], T_points_cam @ fitted.T_cam_obj, T_points_obj)
+    J_points_cam = torch.eye(4).to(fitted.covariance_xyz_yaw).repeat(len(kept), 1, 1)
+    J_points_cam[:, :3, :3] = T_points_cam[:, :3, :3]
+    covariance = J_points_cam @ fitted.covariance_xyz_yaw @ J_points_cam.mT
+    # The masks are invented.
+    quality = replace(fitted.quality, mask_iou_left=torch.full_like(fitted.quality.mask_iou_left, torch.nan))
+    cars = replace(fitted, T_cam_obj=kept, covariance_xyz_yaw=covariance, quality=quality)
+    return ShapeFit(cars, samples.counts, *distances)
 
 
 def _fitter(prior: ShapePrior | None, samples: PointSamples) -> DirectShapeRefiner:

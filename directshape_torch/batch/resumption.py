@@ -25,6 +25,7 @@ from directshape_torch.io.run_folder import (
 )
 from directshape_torch.io.run_manifest import (
     RESUME_CURE,
+    UNKNOWN_CURE,
     FrameEntry,
     RunManifest,
     check_mapping,
@@ -123,7 +124,7 @@ class EarlierResults:
             if folder.is_dir() and any(folder.iterdir()):
                 raise ResumeError(
                     f"cannot resume: {folder} holds files, but {summary_path(self.out_dir)} is missing, so what they "
-                    f"were made of is unknown; {RESUME_CURE}"
+                    f"were made of is unknown; {UNKNOWN_CURE}"
                 )
 
 

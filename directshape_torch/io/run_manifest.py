@@ -25,7 +25,7 @@ from directshape_torch.shape.shape_prior import ShapePrior
 MANIFEST_SCHEMA_VERSION = 2
 RESUME_CURE = "choose another output folder, or start again with --fresh, which removes the results in this one"
 # Nobody knows which files are results there, so --fresh removes none.
-_UNREADABLE_CURE = "choose another output folder, or remove this one"
+UNKNOWN_CURE = "choose another output folder, or remove this one"
 
 
 class RunSettings(TypedDict, total=False):
@@ -150,18 +150,18 @@ def read_manifest(path: Path | str) -> RunManifest | None:
     """
     if not Path(path).is_file():
         return None
-    content = read_json(path, _UNREADABLE_CURE)
+    content = read_json(path, UNKNOWN_CURE)
     if not isinstance(content, dict) or "schema_version" not in content:
-        raise DataFormatError(path, "is no summary of a run", cure=_UNREADABLE_CURE)
+        raise DataFormatError(path, "is no summary of a run", cure=UNKNOWN_CURE)
     version = content.pop("schema_version")
     if version != MANIFEST_SCHEMA_VERSION:
         said = f"{path}: schema version is {shown(version)}, this program writes {MANIFEST_SCHEMA_VERSION}"
-        raise ResumeError(f"{said}; {_UNREADABLE_CURE}")
-    manifest = record_of(path, RunManifest, content, _UNREADABLE_CURE)
-    check_type(path, "config", manifest.config, RunSettings, _UNREADABLE_CURE)
+        raise ResumeError(f"{said}; {UNKNOWN_CURE}")
+    manifest = record_of(path, RunManifest, content, UNKNOWN_CURE)
+    check_type(path, "config", manifest.config, RunSettings, UNKNOWN_CURE)
     for frame_id in manifest.frames:
         if not is_frame_id(frame_id):
-            raise DataFormatError(path, f"frames[{shown(frame_id)}]: no name of a frame", cure=_UNREADABLE_CURE)
+            raise DataFormatError(path, f"frames[{shown(frame_id)}]: no name of a frame", cure=UNKNOWN_CURE)
     return manifest
 
 
