@@ -271,18 +271,17 @@ def _blueprint(size_wh: tuple[int, int], with_iterations: bool) -> Any:
     import rerun.blueprint as rrb
 
     bounds = rrb.VisualBounds2D(x_range=[0, size_wh[0]], y_range=[0, size_wh[1]])
-    camera, left, right = "world/cam", "world/cam/image", "right/image"
 
     def image(name: str, origin: str, *contents: str) -> Any:
         return rrb.Spatial2DView(origin=origin, name=name, contents=list(contents), visual_bounds=bounds)
 
-    views = [image("left: masks and boxes", camera, left, f"{left}/masks", "world/boxes/**")]
-    seen_right = image("right: masks", "right", right, f"{right}/masks")
+    views = [image("left: masks and boxes", "world/cam", _LEFT, f"{_LEFT}/masks", "world/boxes/**")]
+    seen_right = image("right: masks", "right", _RIGHT, f"{_RIGHT}/masks")
     if with_iterations:
-        photometric = image("left: right image less left", left, left, f"{left}/photometric/**")
+        photometric = image("left: right image less left", _LEFT, _LEFT, f"{_LEFT}/photometric/**")
         silhouettes = [
             image(f"{side}: silhouettes", entity, entity, f"{entity}/silhouette/**")
-            for side, entity in (("left", left), ("right", right))
+            for side, entity in (("left", _LEFT), ("right", _RIGHT))
         ]
         views += [photometric, rrb.Tabs(*silhouettes, seen_right)]
         views.append(rrb.TimeSeriesView(origin="cost", name="cost of each car"))

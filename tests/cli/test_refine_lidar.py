@@ -108,8 +108,8 @@ def test_a_missing_or_damaged_scan_fails_its_frame_by_name(
     assert at + "expected finite coordinates, got [9.0, nan, 0.0] in point 1" in failure(cut)
 
 
-def test_a_calibration_without_scanner(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (bare := tmp_path / "bare").mkdir()
-    write_data_set(bare, FRAMES)
-    assert refine(bare, tmp_path / "out", "--lidar", source / "velodyne") == 1
+def test_a_calibration_without_scanner(
+    source: Path, kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert refine(kitti, tmp_path / "out", "--lidar", source / "velodyne") == 1
     assert "calib/000000.txt: has no line R0_rect:; LiDAR needs R0_rect and Tr_velo_to_cam" in capsys.readouterr().err

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from helpers.kitti_folder import write_data_set
 from test_refine_command import command
 
 from directshape_torch.cli.main import main
@@ -15,11 +15,8 @@ from directshape_torch.rig.rig_file import load_rigs, save_field
 
 
 @pytest.fixture
-def source(tmp_path: Path) -> Path:
-    root = tmp_path / "kitti"
-    root.mkdir()
-    write_data_set(root, ("000000", "000001"))
-    return root
+def source(kitti: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(kitti, tmp_path / "kitti"))
 
 
 def another_rig(root: Path, frame_id: str) -> None:
