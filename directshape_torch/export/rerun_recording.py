@@ -241,7 +241,7 @@ class _Stream:
         from scipy.spatial.transform import Rotation
 
         corners = corners_cam.astype(np.float64).reshape(-1, 8, 3)
-        axes = corners[:, [0, 0, 1]] - corners[:, [3, 4, 0]]
+        axes = corners[:, :1] - corners[:, [3, 4, 1]]
         sizes = np.linalg.norm(axes, axis=2)
         # Axes are rows here.
         inverse = Rotation.from_matrix(axes / sizes[:, :, None]) if len(axes) else None
