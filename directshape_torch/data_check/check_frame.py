@@ -84,8 +84,8 @@ def check_frame(dataset: StereoDataset, frame_id: str) -> tuple[list[Finding], i
 
 
 def _read_pair(files: FrameFiles, attempt: _Attempts) -> Pair | None:
-    sides = {"left_image": files.left, "right_image": files.right}
-    left, right = (attempt(check, "a whole PNG or JPEG", partial(read_rgb, path)) for check, path in sides.items())
+    left = attempt("left_image", "a whole PNG or JPEG", partial(read_rgb, files.left))
+    right = attempt("right_image", "a whole PNG or JPEG", partial(read_rgb, files.right))
     if left is None or right is None:
         return None
     return attempt("image_size", "one size", partial(as_pair, left, right, files.right))
