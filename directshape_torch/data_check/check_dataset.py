@@ -11,7 +11,7 @@ from typing import Any
 from directshape_torch.data_check.check_frame import check_frame
 from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
 from directshape_torch.io.stereo_dataset import StereoDataset
-from directshape_torch.rig.estimate import RigEstimate, rig_among
+from directshape_torch.rig.estimate import FEWEST_CARS, RigEstimate, rig_among
 from directshape_torch.rig.rig import Rig
 from directshape_torch.scene_check.car_evidence import FrameEvidence
 from directshape_torch.scene_check.check_scene import check_cars
@@ -20,7 +20,6 @@ from directshape_torch.scene_check.finding import CheckReport, Finding, by_sever
 DEFAULT_MAX_FRAMES = 20
 REPORT_SCHEMA_VERSION = 1
 _NAMED = 3
-FEWEST_CARS = 8
 # 0.15 px are 0.35 m at 30 m on KITTI's rig.
 LARGEST_OFFSET_PX, LARGEST_BIAS = 0.15, 0.03
 _SURE = 2.0  # standard deviations

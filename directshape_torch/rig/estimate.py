@@ -22,8 +22,9 @@ from directshape_torch.scene import Detections, FrameBatch
 
 # A service runs for years; so many cars say all that cars can say.
 _MOST_ROWS = 1000
-# Of fewer the noise of a detector is a guess.
-_FEWEST_CARS = 10
+FEWEST_CARS = 10
+"""Of fewer the noise of a detector, and on a rig like KITTI's the field too, are guesses."""
+
 # No image is wider, and the powers of larger numbers leave a sum no digits.
 _LARGEST_PX = 1e5
 # Half of a car's image: where it stands the field is seen.
@@ -164,7 +165,7 @@ class RigEstimate(nn.Module):
         depth to the contours, which on KITTI know it less well than a disparity that is off by a quarter of a pixel
         (docs/your_rig.md).
         """
-        if detections.pose_sigma is not None or len(self.rows) < _FEWEST_CARS:
+        if detections.pose_sigma is not None or len(self.rows) < FEWEST_CARS:
             return detections
         origin = detections.T_cam_obj.detach()[:, :3, 3]
         along = math.hypot(*self.detector[:3]) * torch.hypot(origin[:, 0], origin[:, 2])

@@ -30,7 +30,9 @@ def another_rig(root: Path, frame_id: str) -> None:
 def test_is_estimated_kept_and_shown(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert main(command(source, out, "--frames", "0")) == 0
-    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("rig: "))
+    printed = capsys.readouterr()
+    line = next(line for line in printed.out.splitlines() if line.startswith("rig: "))
+    assert "cars hardly show the rig" in printed.err
     assert line.endswith("%")
     (rig,) = load_rigs(out / "rig.json")
     assert len(rig.rows) > 1
