@@ -12,28 +12,22 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
-from helpers.faulty_refiners import QuickRefiner
+from helpers import quick_runs
 from helpers.kitti_folder import FRAMES, write_data_set
 from helpers.output_folders import result_files
-from helpers.quick_runs import dataset
 
 import directshape_torch
-from directshape_torch.batch.options import RefineOptions, RunObserver
-from directshape_torch.batch.refine_dataset import refine_dataset
+from directshape_torch.batch.options import RunObserver
 from directshape_torch.batch.run_status import read_status
-from directshape_torch.batch.run_summary import RunSummary
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder, done_frames
 
-ALONE = RefineOptions(threads=1)
-
-
-def refine(root: Path, out: Path, options: RefineOptions = ALONE, observer: RunObserver | None = None) -> RunSummary:
-    return refine_dataset(dataset(root), QuickRefiner(root), out, options, observer)
+refine = partial(quick_runs.refine, threads=1)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +52,7 @@ def test_workers_that_are_killed_as_they_start(shared_kitti: Path, tmp_path: Pat
 
     killer = threading.Thread(target=kill, daemon=True)
     killer.start()
-    summary = refine(shared_kitti, tmp_path / "out", RefineOptions(workers=1, retries=2))
+    summary = refine(shared_kitti, tmp_path / "out", workers=1, retries=2)
     killer.join()
     assert (len(killed), summary.exit_code) == (2, 0)
     assert result_files(tmp_path / "out") == result_files(undisturbed)
