@@ -288,6 +288,13 @@ def test_figures_that_became_worse_are_red(opened: Chrome) -> None:
             assert ("good" if change > 0 else "bad") in tone.split()
 
 
+def test_the_summary_says_which_cars_its_errors_are_of(opened: Chrome) -> None:
+    tiles = opened.find_element("id", "summary").text
+    said = opened.find_elements("id", "judged")
+    number = int(tiles.split("BEV IoU, mean of ")[1].split()[0])
+    assert f"of the {number} cars whose label is at least 25 px high" in said[0].text
+
+
 def test_dark_and_light(opened: Chrome) -> None:
     def lightness(element: Any) -> float:
         return float(np.median(screenshot_of(element)))

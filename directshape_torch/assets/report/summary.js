@@ -9,7 +9,7 @@ export function showSummary() {
   byId("subtitle").textContent = `${counted(run.frames_done, "frame")}, ${counted(run.cars, "car")}, ${run.refined} refined`;
   byId("made-by").textContent =
     `Written by directshape_torch (results of version ${run.package_version}). 3D views by three.js, MIT licence.`;
-  byId("summary").append(...[tiles(), rig(), notes(), failures(), statuses(), settings()].filter((part) => part !== null));
+  byId("summary").append(...[tiles(), judged(), rig(), notes(), failures(), statuses(), settings()].filter((part) => part !== null));
 }
 
 function tiles() {
@@ -35,6 +35,13 @@ function tiles() {
   }
   return element("dl", { class: "tiles" }, ...entries.map(([name, value, kind]) =>
     element("div", { class: "tile" }, element("dt", {}, name), element("dd", { class: kind ?? null }, value))));
+}
+
+function judged() {
+  if (run.errors === null || run.errors.cars === run.cars) return null;
+  const of = counted(run.errors.cars, "car");
+  const rule = "at least 25 px high, at most partly hidden and at most half outside of the image";
+  return element("p", { class: "quiet", id: "judged" }, `IoU and errors above are of the ${of} whose label is ${rule}; the table holds all.`);
 }
 
 function shares(errors) {
