@@ -15,8 +15,11 @@ from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.disparity_field import polynomial_basis
 from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.io.kitti_calibration import KittiCalibration
 from directshape_torch.rig.estimate import RigEstimate
+from directshape_torch.rig.from_files import known_depth_from_lidar
 from directshape_torch.rig.pixels import pixel_evidence
+from directshape_torch.rig.rig import Rig
 from directshape_torch.rig.rig_file import load_fields, load_rigs
 
 SIZE = (400, 160)
@@ -65,6 +68,20 @@ def test_fit_recovers_the_field_under_a_fifth_of_wrong_matches_on_one_side() -> 
 def test_too_few_observations_are_refused() -> None:
     with pytest.raises(InputError, match="at least 50"):
         pixel_evidence(torch.zeros(49, 4).double(), SIZE)
+
+
+def test_a_point_right_behind_a_nearer_one_and_those_outside_are_left_out(tmp_path: Path) -> None:
+    scan = np.array([[10, 0, 0, 0], [40, 0.2, 0, 0], [20, 5, 1, 0], [-10, 0, 0, 0], [10, 50, 0, 0]], dtype="<f4")
+    scan.tofile(tmp_path / "scan.bin")
+    P2 = np.array([[300.0, 0, 200, 0], [0, 300, 80, 0], [0, 0, 1, 0]])
+    P3 = P2 - np.array([[0, 0, 0, 150.0], [0, 0, 0, 0], [0, 0, 0, 0]])
+    # x forward, y left, z up becomes x right, y down, z forward.
+    velo_to_cam = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]])
+    calibration = KittiCalibration(Path("calib.txt"), P2, P3, np.eye(3), velo_to_cam)
+    known = known_depth_from_lidar(tmp_path / "scan.bin", calibration, Rig.of(camera(), SIZE))
+    # (20, 5, 1): 300 * -5 / 20 + 200 = 125 and 300 * -1 / 20 + 80 = 65; the second point is 1.5 px beside the first.
+    expected = torch.tensor([[200.0, 80.0, 10.0], [125.0, 65.0, 20.0]], dtype=torch.float64)
+    torch.testing.assert_close(known, expected)
 
 
 def write_frame(root: Path, frame_id: str, bias_px: float, focal_px: float = FOCAL_PX) -> None:
