@@ -111,16 +111,19 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     reflectance = np.zeros((len(points), 1), dtype=np.float32)
     (tmp_path / "scan.bin").write_bytes(np.hstack([points.numpy(), reflectance]).astype("<f4").tobytes())
     np.save(tmp_path / "points.npy", points.numpy())
-    np.savetxt(tmp_path / "boxes.txt", (TRUE_BOXES + ERRORS).numpy())
+    far = TRUE_BOXES[:1] + torch.tensor([[50.0, 0, 0, 0, 0, 0, 0]])
+    np.savetxt(tmp_path / "boxes.txt", torch.cat([TRUE_BOXES + ERRORS, far]).numpy())
     for name in ("scan.bin", "points.npy"):
         words = ["--points", str(tmp_path / name), "--boxes", str(tmp_path / "boxes.txt")]
         assert main(["fit-shape", *words, "--out", str(tmp_path / "out")]) == 0
-        assert "converged" in capsys.readouterr().out
+        said = capsys.readouterr().out
+        assert "converged" in said
+        assert "car 2: no points in this box, too_few_points\n" in said
         boxes = np.loadtxt(tmp_path / "out" / "boxes.txt")
-        assert boxes[:, :2] == pytest.approx(TRUE_BOXES[:, :2].numpy(), abs=0.2)
+        assert boxes[:2, :2] == pytest.approx(TRUE_BOXES[:, :2].numpy(), abs=0.2)
         assert {path.name for path in (tmp_path / "out" / "meshes").iterdir()} == {"000.ply", "001.ply"}
         with np.load(tmp_path / "out" / "shapes.npz") as arrays:
-            assert arrays["T_points_obj"].shape == (2, 4, 4)
+            assert arrays["T_points_obj"].shape == (3, 4, 4)
     (tmp_path / "boxes.txt").write_text("1 2 3\n")
     assert main(["fit-shape", *words, "--out", str(tmp_path / "out")]) == 2
     assert "line 1: expected 7 finite numbers, got 3: '1 2 3'" in capsys.readouterr().err

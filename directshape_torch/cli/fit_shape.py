@@ -103,7 +103,9 @@ def _fit_cloud(args: argparse.Namespace) -> int:
     write_npz(args.out / "shapes.npz", fit.arrays("points"))
     for row, status in enumerate(cars.status):
         before, after = float(fit.distance_before_m[row]), float(fit.distance_after_m[row])
-        print(f"car {row}: {int(fit.num_points[row])} points, {before:.3f} -> {after:.3f} m, {status.name}")
+        count = int(fit.num_points[row])
+        found = f"{count} points, {before:.3f} -> {after:.3f} m" if count else "no points in this box"
+        print(f"car {row}: {found}, {status.name}")
         if status.is_refined:
             write_bytes(args.out / "meshes" / f"{row:03d}.ply", export_ply(cars.mesh(row)))
     print(f"results  {args.out}")
