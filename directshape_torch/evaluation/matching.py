@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from directshape_torch.errors import InputError
 from directshape_torch.files.read_files import read_lines
 from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.io.frame_layout import frames_among
@@ -63,9 +64,12 @@ def chosen_frames(
     """Those of the known frames that a caller names by id or number, or in a file with one a line; all by default.
 
     Raises:
-        InputError: unknown ones, in the words for what was expected.
+        InputError: unknown ones, in the words for what was expected, or none at all.
         DataFormatError: the file cannot be read.
     """
     if split is not None:
         known = frames_among(known, [line.text for line in read_lines(split)], expected)
-    return list(known) if frames is None else frames_among(known, frames, expected)
+    chosen = list(known) if frames is None else frames_among(known, frames, expected)
+    if not chosen:
+        raise InputError("frames", f"at least one of the {expected}", "none", "check the choice of frames")
+    return chosen

@@ -16,7 +16,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.projection import depth_from_disparity, rays_from_pixels
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_detections import match_masks
-from directshape_torch.io.image_files import read_disparity
+from directshape_torch.io.image_files import read_disparity, read_single_channel
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.refinement.ray_cast import cast
@@ -173,8 +173,7 @@ def segments_of(
     Raises:
         DataFormatError: the map or the masks are missing or damaged.
     """
-    stored = read_disparity(path).astype(np.float64)
-    depth = stored if path.parent.name == "depth_2" else _depth_of(stored, camera)
+    depth = read_depth(path) if path.parent.name == "depth_2" else _depth_of(read_disparity(path), camera)
     found = [mask for mask in masks.read(path.stem, depth.shape) if mask.side == "left"]
     boxes = np.array([label.box_2d for label in labels], dtype=np.float64).reshape(-1, 4)
     truths: dict[int, SegmentTruth] = {}
@@ -200,9 +199,17 @@ def segment_truth(
     return SegmentTruth(name, uv, depth_m[v, u, None] * rays_cam, K_left)
 
 
-def _depth_of(disparity: NDArray[np.float64], camera: StereoCamera) -> NDArray[np.float64]:
+def read_depth(path: Path) -> NDArray[np.float64]:
+    """A map of 16 bits, metres times 256, as (H, W) metres, NaN where it is 0: everywhere where nothing is known."""
+    stored = read_single_channel(path)
+    if stored.dtype != np.uint16:
+        raise DataFormatError(path, f"expected 16 bits (metres times 256), got {stored.dtype}")
+    return np.where(stored > 0, stored / 256.0, np.nan)
+
+
+def _depth_of(disparity: NDArray[np.float32], camera: StereoCamera) -> NDArray[np.float64]:
     """Metres; the residual disparity field of a rig plays no part: it corrects what a pair measures, not the truth."""
     height, width = disparity.shape
     uv = torch.from_numpy(np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64))
     K_left, K_right, T_right_cam = (x[0].double() for x in (camera.K_left, camera.K_right, camera.T_right_cam))
-    return depth_from_disparity(uv, torch.from_numpy(disparity), K_left, K_right, T_right_cam).numpy()
+    return depth_from_disparity(uv, torch.from_numpy(disparity).double(), K_left, K_right, T_right_cam).numpy()

@@ -127,6 +127,8 @@ def test_frames_and_split_choose(folders: tuple[Path, Path, Path], tmp_path: Pat
     assert compare_results(*folders, frames=[1]).overall.num_detections == 2
     with pytest.raises(InputError, match=r"frames: expected frames of .*, such as 000002, got 1"):
         compare_results(*folders, split=tmp_path / "split.txt", frames=[1])
+    with pytest.raises(InputError, match=r"frames: expected at least one of the frames of .*, got none"):
+        compare_results(*folders, frames=[])
 
 
 def test_files_that_do_not_belong_together_are_named(folders: tuple[Path, Path, Path]):
@@ -150,7 +152,7 @@ def test_empty_files_and_no_files(tmp_path: Path):
     assert comparison.overall.worse_share is None
     assert "nothing to compare" in format_comparison(comparison)
     (tmp_path / "none").mkdir()
-    with pytest.raises(InputError, match="frames: expected at least one frame"):
+    with pytest.raises(InputError, match=r"frames: expected at least one frame"):
         compare_results(parts[0], tmp_path / "none", parts[2])
 
 

@@ -112,3 +112,7 @@ class TestFilesAndErrors:
     def test_a_split_with_a_frame_that_has_no_labels(self, folders: tuple[Path, Path]) -> None:
         with pytest.raises(InputError, match=r"frames with labels in .*, such as 000001, got 000009"):
             evaluate_kitti(*folders, frames=[1, "000009"])
+        with pytest.raises(
+            InputError, match=r"frames: expected at least one of the frames with labels in .*, got none"
+        ):
+            evaluate_kitti(*folders, frames=[])

@@ -22,6 +22,7 @@ from directshape_torch.cli.main import main
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation import matching
 from directshape_torch.evaluation.evaluate_shapes import ShapeScores, evaluate_shapes
+from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.projection import depth_from_disparity
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
@@ -140,7 +141,6 @@ def test_command(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "95 % intervals, bootstrap over cars" in text
     assert re.search(r"\ntau 0.05 m  2  .*  100.0 % \[100.0, 100.0\]", text)
     content = json.loads((tmp_path / "s.json").read_text())
-    assert content["schema_version"] == 1
     assert [curve["metric"] for curve in content["curves"]] == ["completeness", "accuracy", "f1", "rmse_m"]
     for curve in content["curves"]:
         assert len(curve["taus_m"]) == len(curve["summaries"]) == len(curve["num_cars"]) == 20
@@ -150,7 +150,8 @@ def test_command(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert float(rows[0]["completeness_after"]) > 0.99
     documented = (Path(__file__).parents[2] / "docs" / "file_formats.md").read_text(encoding="utf-8")
     documented = documented[documented.index("## Shape scores (`evaluate-shape") :]
-    assert all(f'"{name}":' in documented for part in (content, content["curves"][0]) for name in part)
+    assert content.pop("schema_version") == 1
+    assert all(f"`{name}`" in documented for part in (content, content["curves"][0]) for name in part)
     assert all(f"`{re.sub('_(before|after)$', '', name)}`" in documented for name in rows[0])
 
 
@@ -179,10 +180,26 @@ def test_errors_name_what_is_wrong(root: Path, tmp_path: Path, capsys: pytest.Ca
 
 
 def test_library_errors(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="at least one of the frames with ground truth, got none"):
+        evaluate(root, frames=[])
     for frame_id in FRAMES:
         (tmp_path / f"{frame_id}.txt").write_text("")
     with pytest.raises(InputError, match="a counted label with a detection and a true surface, got none in 2 frames"):
         evaluate(root, labels_dir=tmp_path)
+
+
+def test_a_frame_whose_map_of_depth_is_empty_has_no_true_surface(root: Path, tmp_path: Path) -> None:
+    shutil.copytree(root, tmp_path / "root")
+    shutil.rmtree(tmp_path / "root" / "training" / "disp_occ_0")
+    both = evaluate(tmp_path / "root")
+    empty = tmp_path / "root" / "training" / "depth_2" / f"{FRAMES[1]}.png"
+    write_png(empty, np.zeros((120, 160), dtype=np.uint16))
+    one = evaluate(tmp_path / "root")
+    assert (one.num_frames, one.num_labels_counted) == (both.num_frames, both.num_labels_counted)
+    assert one.num_without_truth == both.num_without_truth + len(both.cars) // 2
+    write_png(empty, np.zeros((120, 160), dtype=np.uint8))
+    with pytest.raises(DataFormatError, match=r"expected 16 bits \(metres times 256\), got uint8"):
+        evaluate(tmp_path / "root")
 
 
 def test_detections_of_another_run_are_named(root: Path, tmp_path: Path) -> None:
