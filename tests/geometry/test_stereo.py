@@ -88,9 +88,12 @@ K = torch.tensor([[700.0, 0.4, 600.0], [0.0, 690.0, 180.0], [0.0, 0.0, 1.0]], dt
 
 @pytest.mark.parametrize("shape", [(), (0,), (1,), (4,), (2, 3)])
 def test_project_undoes_back_projection(shape: tuple[int, ...]) -> None:
+    """Each point by a camera of its own."""
+    cameras = K.repeat(*shape, 1, 1)
+    cameras[..., :2, :] *= 1 + torch.rand(*shape, 1, 1, dtype=torch.float64)
     uv = 1000 * torch.rand(*shape, 2, dtype=torch.float64)
     depth = 1 + 50 * torch.rand(*shape, 1, dtype=torch.float64)
-    torch.testing.assert_close(project(depth * rays_from_pixels(uv, K), K), uv)
+    torch.testing.assert_close(project(depth * rays_from_pixels(uv, cameras), cameras), uv)
 
 
 def test_projection_by_hand() -> None:

@@ -45,7 +45,10 @@ def test_gradient_is_autograds(seed: int, height: int, width: int, padding: int)
     images = random_images(seed, (2, height + padding, width + padding))
     sizes = torch.tensor([[height, width]] * 2) if padding else None
     # A third of the points outside, so that the clamped derivative is compared too.
-    uv = (1.5 * random_uv(seed + 1, (2, 30), height + 1, width + 1) - 0.5).requires_grad_()
+    uv = 1.5 * random_uv(seed + 1, (2, 30), height + 1, width + 1) - 0.5
+    # And at the first and the last centre, where a clamp may halve or lose it.
+    uv[:, :2] = torch.tensor([[0, 0], [width - 1, height - 1]])
+    uv.requires_grad_()
     value, gradient, _ = bilinear_with_gradient(images, torch.arange(2)[:, None], uv, sizes)
     (from_autograd,) = torch.autograd.grad(value.sum(), uv)
     torch.testing.assert_close(gradient, from_autograd, rtol=0, atol=1e-9)

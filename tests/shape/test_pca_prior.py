@@ -43,13 +43,19 @@ def prior(samples) -> PCAShapePrior:
 def test_unweighted_components_equal_those_of_a_singular_value_decomposition(samples):
     prior = fit_pca(samples, ORIGIN, SPACING_M, 3, MADE, surface_band_m=None)
     centred = (samples - samples.mean(0)).flatten(1)
-    _, singular, directions = torch.linalg.svd(centred, full_matrices=False)
+    left, singular, directions = torch.linalg.svd(centred, full_matrices=False)
     sigma = singular[:3] / (len(samples) - 1) ** 0.5
     expected = directions[:3] * sigma[:, None]
     found = prior.basis.reshape(-1, 3).T
     signs = (found * expected).sum(1).sign()
     torch.testing.assert_close(found, expected * signs[:, None], atol=1e-9, rtol=0)
     torch.testing.assert_close(prior.explained_variance_ratio, singular[:3] ** 2 / (singular**2).sum())
+    extents = zero_level_extents(samples, ORIGIN, SPACING_M)
+    hwl = (extents[:, 1] - extents[:, 0])[:, [1, 2, 0]]
+    code = left[:, :3] * (len(samples) - 1) ** 0.5 * signs
+    torch.testing.assert_close(
+        prior.dimensions_basis_hwl, torch.linalg.lstsq(code, hwl - hwl.mean(0)).solution.T, atol=1e-9, rtol=0
+    )
 
 
 def test_positive_first_code_makes_the_car_larger(prior):

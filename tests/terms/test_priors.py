@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import pytest
 import torch
 from helpers.ground import cars_on
-from helpers.twists import twists
 from torch import Tensor
 
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti, viewing_axes
 from directshape_torch.shape.shape_prior import DimensionsDerivative
-from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.priors import (
-    PriorResidual,
     dimensions_prior,
     height_prior,
     pose_prior,
@@ -25,27 +22,13 @@ from directshape_torch.terms.priors import (
 )
 
 NUM_CODES = 3
-NORMAL = torch.nn.functional.normalize(torch.tensor([0.02, -1.0, -0.03], dtype=torch.float64), dim=0)
-OFFSET = torch.tensor(1.62, dtype=torch.float64)
 MEAN_HWL = torch.tensor([1.5, 1.6, 3.9], dtype=torch.float64)
 BASIS_HWL = torch.tensor([[0.1, 0.0, 0.02], [0.03, 0.1, 0.0], [0.3, -0.1, 0.2]], dtype=torch.float64)
 SIGMA_HWL = torch.tensor([0.1, 0.1, 0.4], dtype=torch.float64)
 
 
-def _on_ground(form: Callable[[CarBatch, CarState], PriorResidual]) -> Callable[[CarState], PriorResidual]:
-    return lambda state: form(cars_on(NORMAL, OFFSET, len(state.code)), state)
-
-
 def _linear_dimensions(code: Tensor) -> DimensionsDerivative:
     return DimensionsDerivative(MEAN_HWL + code @ BASIS_HWL.T, BASIS_HWL.expand(len(code), -1, -1))
-
-
-def states(regime: str) -> CarState:
-    T_cam_obj = se3.exp(0.5 * twists("normal", 4))
-    depth = {"typical": 15.0, "near": 3.0, "far": 80.0, "three_sigma": 15.0}[regime]
-    T_cam_obj[:, :3, 3] = torch.tensor([2.0, 1.6, depth], dtype=torch.float64)
-    code = 3.0 * torch.ones(4, NUM_CODES, dtype=torch.float64) if regime == "three_sigma" else torch.zeros(4, NUM_CODES)
-    return CarState.of(se3.inverse(T_cam_obj), code.double())
 
 
 def _standing(height_m: float, roll_rad: float = 0.0) -> CarState:
@@ -62,6 +45,9 @@ def test_height_by_hand() -> None:
     """A car 0.3 m above the ground: r is the y coordinate of the origin minus that of the ground, -0.3."""
     result = height_prior(LEVEL, _standing(0.3))
     torch.testing.assert_close(result.residual, torch.tensor([[-0.3]], dtype=torch.float64))
+    # On a slope through the point 0.3 m below the origin: 0.8 * 1.65 + 0.6 * 20 = 13.32.
+    slope = cars_on(torch.tensor([0.0, -0.8, -0.6], dtype=torch.float64), torch.tensor(13.32, dtype=torch.float64), 1)
+    torch.testing.assert_close(height_prior(slope, _standing(0.3)).residual, result.residual)
     # The camera moving down by v_y of the object frame moves the object up: J_v = -[0, 1, 0] R_cam_obj = [0, -1, 0].
     torch.testing.assert_close(result.J_residual_state[0, 0, :3], torch.tensor([0.0, -1.0, 0.0]).double())
     assert (result.J_residual_state[0, 0, 3:] == 0).all()
