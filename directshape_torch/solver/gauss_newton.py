@@ -20,6 +20,10 @@ from directshape_torch.solver.problem import (
 )
 from directshape_torch.status import Status, is_refined
 
+# What leaving ended problems out must save, in iterations of one: the others are copied for it, and few problems take
+# nearly as long as fewer, one by itself longer than two (it has no compiled form).
+_WORTH_LEAVING_OUT = 16
+
 
 @dataclass(frozen=True)
 class Iteration(Generic[StateT]):
@@ -93,7 +97,7 @@ class _Log(Generic[StateT]):
         """The costs of a block into columns (B, iterations) of all problems."""
         if not self.costs:
             return
-        # Problems that have ended stay in the batch until the block does.
+        # Problems that have ended stay in the batch until it is worth leaving them out.
         columns = torch.where(torch.stack(self.running, dim=1), torch.stack(self.costs, dim=1), torch.nan)
         nan = columns.new_full((len(self.all_states[0]), len(self.costs)), torch.nan)
         self.history.append(nan.index_copy(0, rows, columns))
@@ -189,7 +193,7 @@ def _run_stage(
     limits = begun.step_limits().to(progress.at_state.gradient)
     failed: set[int] = set()
     done = 0
-    while done < stage.max_iterations and numbers:
+    while done < stage.max_iterations:
         for _ in range(min(config.block_iterations, stage.max_iterations - done)):
             before = (progress.state, progress.damping, progress.stretched)
             outcome = iterate(part, progress, config, limits, stage.over_relaxation)
@@ -199,17 +203,15 @@ def _run_stage(
         codes = _read(progress.ended)
         failed |= {n for n, code in zip(numbers, codes, strict=True) if code not in (RUNNING, Status.converged.code)}
         places = [place for place, code in enumerate(codes) if code < 0]
-        if len(places) < len(numbers):
+        if not places:
+            break
+        if (len(numbers) - len(places)) * (stage.max_iterations - done) >= _WORTH_LEAVING_OUT:
             state, ended, iterations = progress.scatter(rows, state, ended, iterations)
             numbers = [numbers[place] for place in places]
-            if not numbers or done == stage.max_iterations:
-                numbers = []
-                break
             keep = progress.ended < 0
             rows = rows[torch.nonzero_static(keep, size=len(places))[:, 0]]
             part, progress = progress.take(part, keep, places)
-    if numbers:
-        state, ended, iterations = progress.scatter(rows, state, ended, iterations)
+    state, ended, iterations = progress.scatter(rows, state, ended, iterations)
     if done:
         unfailed = _Unfailed(~has_failed(ended), [number for number in unfailed.numbers if number not in failed])
     return state, ended, iterations, unfailed
