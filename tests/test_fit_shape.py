@@ -130,6 +130,9 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "points.npy").write_bytes(b"nothing")
     assert main(["fit-shape", *words, "--out", str(tmp_path / "out")]) == 2
     assert "points.npy: is no readable npy file" in capsys.readouterr().err
+    np.save(tmp_path / "points.npy", np.zeros((0, 3)))
+    assert main(["fit-shape", *words, "--out", str(tmp_path / "out")]) == 2
+    assert "expected one point or more as numbers (P, 3 or more), got float64" in capsys.readouterr().err
 
 
 def scanned_dataset(root: Path) -> tuple[Path, Path]:

@@ -41,7 +41,8 @@ def read_points(path: Path | str) -> NDArray[np.float64]:
     if Path(path).suffix == ".npy":
         points = read_npy(path)
         if points.ndim != 2 or points.shape[1] < 3 or not len(points) or points.dtype.kind not in "fiu":
-            raise DataFormatError(path, f"expected numbers (P, 3), got {points.dtype} of shape {points.shape}")
+            got = f"{points.dtype} of shape {points.shape}"
+            raise DataFormatError(path, f"expected one point or more as numbers (P, 3 or more), got {got}")
     else:
         content = read_bytes(path)
         if len(content) == 0 or len(content) % _BYTES_A_POINT:
