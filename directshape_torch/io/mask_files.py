@@ -58,8 +58,18 @@ class FrameJsonMasks:
         return (path, *soft)
 
     def path(self, frame_id: str) -> Path:
-        """The file without which there are no masks of a frame."""
-        return file_of_frame(self.directory, f"{frame_id}.json")
+        """The file without which there are no masks of a frame.
+
+        Raises:
+            DataFormatError: an instance PNG lies in its place.
+        """
+        path = file_of_frame(self.directory, f"{frame_id}.json")
+        if not path.is_file() and path.with_suffix(".png").is_file():
+            cure = "call their folder instance_2 (instance_02 of a tracking sequence) and give the folder above it"
+            raise DataFormatError(
+                path.with_suffix(".png"), "is an instance PNG, and one json a frame is read", cure=cure
+            )
+        return path
 
 
 @dataclass(frozen=True)

@@ -181,6 +181,8 @@ def test_instance_png_of_the_left_images_alone(tmp_path: Path) -> None:
     source = mask_source(tmp_path)
     assert [mask.side for mask in source.read("000000", SIZE_HW)] == ["left"]
     assert source.files("000000") == (tmp_path / "instance_2" / "000000.png",)
+    with pytest.raises(DataFormatError, match=r"000000\.png: is an instance PNG, .* call their folder instance_2 "):
+        mask_source(tmp_path / "instance_2").read("000000", SIZE_HW)
 
 
 def test_plain_coco_files_of_a_whole_data_set(tmp_path: Path) -> None:
