@@ -67,18 +67,21 @@ def test_an_unforeseen_error_fails_its_frame_alone(shared_kitti: Path, tmp_path:
     assert summary.failed == {FRAMES[1]: "ZeroDivisionError: of this frame alone"}
 
 
-def test_too_little_memory_says_what_to_do(shared_kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA is full"), RuntimeError("can't allocate memory: 9 GB")])
+def test_too_little_memory_says_what_to_do(
+    shared_kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
     def no_memory(*_: object) -> None:
-        raise torch.OutOfMemoryError("CUDA out of memory")
+        raise error
 
     too_big = refiner(shared_kitti)
     monkeypatch.setattr(too_big, "forward", no_memory)
-    summary = refine(shared_kitti, tmp_path, too_big, batch_frames=2)
+    summary = refine(shared_kitti, tmp_path, too_big, batch_frames=3)
     assert summary.exit_code == 1
     assert list(summary.failed) == list(FRAMES)
-    assert "too little memory for 1 frame in a call (OutOfMemoryError: CUDA" in summary.failed["000002"]
-    # Of three frames only the first two were ever refined together.
-    assert any(warning.startswith("1 calls did not work with all of their frames") for warning in summary.warnings)
+    assert f"too little memory for 1 frame in a call ({type(error).__name__}: " in summary.failed["000002"]
+    # 3 = 2 + 1, and 2 = 1 + 1.
+    assert any(warning.startswith("2 calls did not work with all of their frames") for warning in summary.warnings)
 
 
 def test_a_file_that_cannot_be_written_is_reported_and_the_others_go_on(shared_kitti: Path, tmp_path: Path) -> None:

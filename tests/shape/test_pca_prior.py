@@ -40,13 +40,17 @@ def prior(samples) -> PCAShapePrior:
     return fit_pca(samples, ORIGIN, SPACING_M, 4, MADE)
 
 
-def test_unweighted_components_equal_those_of_a_singular_value_decomposition(samples):
-    prior = fit_pca(samples, ORIGIN, SPACING_M, 3, MADE, surface_band_m=None)
-    centred = (samples - samples.mean(0)).flatten(1)
+@pytest.mark.parametrize("band_m", [None, 0.3])
+def test_components_equal_those_of_a_singular_value_decomposition(samples, band_m):
+    """Of distances that are weighed by how near their nodes are to the surfaces, or all alike."""
+    prior = fit_pca(samples, ORIGIN, SPACING_M, 3, MADE, surface_band_m=band_m)
+    near = torch.exp(-0.5 * (samples.flatten(1) / (band_m or torch.inf)) ** 2).mean(0)
+    root = (near if band_m is None else near + 1e-3 * near.max()).sqrt()
+    centred = (samples - samples.mean(0)).flatten(1) * root
     left, singular, directions = torch.linalg.svd(centred, full_matrices=False)
     sigma = singular[:3] / (len(samples) - 1) ** 0.5
     expected = directions[:3] * sigma[:, None]
-    found = prior.basis.reshape(-1, 3).T
+    found = prior.basis.reshape(-1, 3).T * root
     signs = (found * expected).sum(1).sign()
     torch.testing.assert_close(found, expected * signs[:, None], atol=1e-9, rtol=0)
     torch.testing.assert_close(prior.explained_variance_ratio, singular[:3] ** 2 / (singular**2).sum())
