@@ -156,7 +156,7 @@ def _rigs_of_run(dataset: StereoDataset, rig: str, out_dir: Path, fresh: bool) -
     for estimate in rigs:
         print(estimate)
         if 0 < len(estimate.rows) < FEWEST_CARS:
-            few = f"note: {len(estimate.rows)} cars hardly show the rig, and good boxes may become worse"
+            few = f"note: so few cars ({len(estimate.rows)}) hardly show the rig, and good boxes may become worse"
             print(f"{few}: give more frames, or --rig FILE (docs/your_rig.md)", file=sys.stderr)
     return rigs, True
 

@@ -58,10 +58,11 @@ def replaced_file(path: Path | str) -> Iterator[IO[bytes]]:
 
 
 def check_folder(name: str, path: Path) -> None:
-    """Raise `InputError` where a folder cannot be made, for a file has its name or that of one above it."""
-    existing = next(each for each in (path, *path.parents) if each.exists())
+    """Raise `InputError` where a folder cannot be made, for a file or broken link has its name or one above it."""
+    existing = next(each for each in (path, *path.parents) if each.exists() or each.is_symlink())
     if not existing.is_dir():
-        raise InputError(name, "a folder, which is made where it is missing", f"the file {existing}")
+        kind = "file" if existing.exists() else "broken link"
+        raise InputError(name, "a folder, which is made where it is missing", f"the {kind} {existing}")
 
 
 def check_file(name: str, path: Path) -> None:

@@ -136,7 +136,7 @@ def upright_plane(path: Path | str, plane: NDArray[np.float64], line: Line | Non
             "the normal is not near the vertical y axis",
             line_number=None if line is None else line.number,
             line=" ".join(map(str, plane)) if line is None else line.text,
-            cure="see docs/inputs.md" if line is None else _PLANE_CURE,
+            cure="see docs/plain_folder.md" if line is None else _PLANE_CURE,
         )
     return np.asarray(plane / (-np.sign(plane[1]) * length))
 

@@ -13,6 +13,31 @@ from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.kitti_ap import evaluate_kitti, score_frames
 from directshape_torch.evaluation.kitti_rules import score_thresholds
 
+DIFFICULTIES = ("easy", "moderate", "hard")
+
+
+class TestDifficulty:
+    @pytest.mark.parametrize(
+        ("label", "counts"),
+        [
+            (line(height=40.5, occluded=0, truncated=0.15), (1, 1, 1)),
+            (line(height=40), (0, 1, 1)),  # a label must be HIGHER than 40 px
+            (line(height=25.5, occluded=1, truncated=0.30), (0, 1, 1)),
+            (line(height=25), (0, 0, 0)),
+            (line(occluded=1), (0, 1, 1)),
+            (line(occluded=2), (0, 0, 1)),
+            (line(occluded=3), (0, 0, 0)),
+            (line(truncated=0.16), (0, 1, 1)),
+            (line(truncated=0.31), (0, 0, 1)),
+            (line(truncated=0.51), (0, 0, 0)),
+            (line(kind="Van"), (0, 0, 0)),
+            (line(kind="DontCare"), (0, 0, 0)),
+        ],
+    )
+    def test_which_labels_count(self, label: str, counts: tuple[int, int, int]) -> None:
+        scores = evaluate([label], [line(score=1)])
+        assert tuple(scores.score("3d", 0.7, name).num_labels for name in DIFFICULTIES) == counts
+
 
 class TestNeighboursAndRegions:
     def test_people_who_sit_are_neighbours_of_pedestrians_whatever_the_case(self) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from directshape_torch.errors import InputError
 from directshape_torch.files import atomic_files
 from directshape_torch.files.array_files import write_npz
 from directshape_torch.io.image_files import read_rgb, read_single_channel
@@ -92,3 +93,10 @@ def test_png_round_trip_keeps_channel_order_and_16_bits(tmp_path: Path) -> None:
     ids = np.array([[0, 26001], [1002, 65535]], np.uint16)
     atomic_files.write_png(tmp_path / "ids.png", ids)
     np.testing.assert_array_equal(read_single_channel(tmp_path / "ids.png"), ids)
+
+
+def test_where_a_broken_link_stands_no_folder_can_be_made(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    for path in (tmp_path / "link", tmp_path / "link" / "below"):
+        with pytest.raises(InputError, match=f"out: expected a folder, .*, got the broken link {tmp_path}/link$"):
+            atomic_files.check_folder("out", path)

@@ -110,7 +110,7 @@ def test_plane_and_labels(root: Path) -> None:
     assert plane.tolist() == [0, -1, 0, 1.5]
     assert labels[0].score is None
     write(root, "frames/a.json", {**FRAME, "ground_plane": [1, 0, 0, -3]})
-    with pytest.raises(DataFormatError, match=r"the normal is not near the vertical.*docs/inputs\.md"):
+    with pytest.raises(DataFormatError, match=r"the normal is not near the vertical.*docs/plain_folder\.md"):
         files.read_plane()
     write(root, "frames/a.json", FRAME)
     with pytest.raises(DataFormatError, match="holds no 'ground_plane'"):
