@@ -71,8 +71,10 @@ def test_too_few_observations_are_refused() -> None:
 
 
 def test_a_point_right_behind_a_nearer_one_and_those_outside_are_left_out(tmp_path: Path) -> None:
-    scan = np.array([[10, 0, 0, 0], [40, 0.2, 0, 0], [20, 5, 1, 0], [-10, 0, 0, 0], [10, 50, 0, 0]], dtype="<f4")
-    scan.tofile(tmp_path / "scan.bin")
+    in_view = [[10, 0, 0, 0], [40, 0.2, 0, 0], [20, 5, 1, 0]]
+    beside = [[10, 50, 0, 0], [10, -50, 0, 0], [10, 0, 50, 0], [10, 0, -50, 0]]
+    too_near_or_far = [[-10, 3, 2, 0], [0.5, 0.2, 0.05, 0], [500, 90, 20, 0]]
+    np.array(in_view + beside + too_near_or_far, dtype="<f4").tofile(tmp_path / "scan.bin")
     P2 = np.array([[300.0, 0, 200, 0], [0, 300, 80, 0], [0, 0, 1, 0]])
     P3 = P2 - np.array([[0, 0, 0, 150.0], [0, 0, 0, 0], [0, 0, 0, 0]])
     # x forward, y left, z up becomes x right, y down, z forward.
