@@ -7,9 +7,19 @@ from directshape_torch.files.read_files import Line
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
 
 
-def line(slot: int = 0, *, kind: str = "Car", alpha: float = 0, score: float | None = None) -> str:
+def line(
+    slot: int = 0,
+    *,
+    kind: str = "Car",
+    height: float = 50,
+    occluded: int = 0,
+    truncated: float = 0,
+    alpha: float = 0,
+    score: float | None = None,
+) -> str:
     """A car 4 m x 2 m x 1.5 m in a place of its own, in the image 300 px and on the road 10 m from the next."""
-    text = f"{kind} 0 0 {alpha} {300 * slot} 100 {300 * slot + 100} 150 1.5 2 4 {10 * slot} 1.6 20 0"
+    box_2d = f"{300 * slot} 100 {300 * slot + 100} {100 + height}"
+    text = f"{kind} {truncated} {occluded} {alpha} {box_2d} 1.5 2 4 {10 * slot} 1.6 20 0"
     return text if score is None else f"{text} {score}"
 
 
