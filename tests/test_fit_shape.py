@@ -17,6 +17,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.box_formats import boxes_to_poses, poses_to_boxes
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.stereo_dataset import open_dataset
+from directshape_torch.refinement.quality import EVIDENCE_NAMES
 from directshape_torch.shape.zero_level import sdf_to_mesh, zero_level_extents
 
 PRIOR = PCAShapePrior.load_bundled().double()
@@ -87,6 +88,7 @@ def test_standard_deviations_are_in_the_frame_of_the_points_and_no_mask_is_judge
     expected = quarter @ one.covariance_xyz_yaw[:, :3, :3] @ quarter.T
     torch.testing.assert_close(other.covariance_xyz_yaw[:, :3, :3], expected, atol=1e-9, rtol=1e-4)
     assert one.quality.mask_iou_left.isnan().all()
+    assert one.quality.evidence[:, EVIDENCE_NAMES.index("mask_misfit_left")].isnan().all()
 
 
 def test_a_car_without_points_keeps_its_box_and_touches_no_other() -> None:

@@ -16,6 +16,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.numerics.checks import check_shape
+from directshape_torch.refinement.quality import EVIDENCE_NAMES
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rows import PointSamples
@@ -105,7 +106,9 @@ def fit_shape(
     J_points_cam[:, :3, :3] = T_points_cam[:, :3, :3]
     covariance = J_points_cam @ fitted.covariance_xyz_yaw @ J_points_cam.mT
     # The masks are invented.
-    quality = replace(fitted.quality, mask_iou_left=torch.full_like(fitted.quality.mask_iou_left, torch.nan))
+    iou, evidence = fitted.quality.mask_iou_left, fitted.quality.evidence.clone()
+    evidence[:, EVIDENCE_NAMES.index("mask_misfit_left")] = torch.nan
+    quality = replace(fitted.quality, mask_iou_left=torch.full_like(iou, torch.nan), evidence=evidence)
     cars = replace(fitted, T_cam_obj=kept, covariance_xyz_yaw=covariance, quality=quality)
     return ShapeFit(cars, samples.counts, *distances)
 
