@@ -47,9 +47,8 @@ def pack_pixels(
     """
     extents = scene_extents(detections) if extents is None else extents
     regions = car_regions(frames, detections, extents)
-    sides: tuple[Side, Side] = SIDES
     hidden_left, hidden_right = (
-        occlusion_map(detections, side, config.occlusion_order, extents) if config.occlusion else None for side in sides
+        occlusion_map(detections, side, config.occlusion_order, extents) if config.occlusion else None for side in SIDES
     )
     return Observation(
         _pack_side(frames, detections, "left", regions[0], hidden_left, config),
