@@ -40,7 +40,7 @@ class KnownRig(Protocol):
         ...
 
     def informed(self, frames: FrameBatch, detections: Detections) -> Detections:
-        """Detections with the standard deviations of their depths, where they have none."""
+        """Detections with what is not known of their depths and of the rig, where they do not say it."""
         ...
 
 
@@ -195,13 +195,17 @@ class DirectShapeRefiner(nn.Module):
 
     def _with_rig(self, frames: FrameBatch, detections: Detections) -> tuple[FrameBatch, Detections]:
         """The call's inputs, checked, with what is known of the rig and the detector."""
-        frames = frames if self.rig is None else self.rig.corrected(frames)
-        check_fit(frames, detections, self.prior)
+        corrected = frames if self.rig is None else self.rig.corrected(frames)
+        check_fit(corrected, detections, self.prior)
         if self.rig is None:
             return frames, detections
-        # What the settings say of the detector wins.
-        is_said = any(self.config.priors.pose_sigmas)
-        return frames, detections if is_said else self.rig.informed(frames, detections)
+        informed = self.rig.informed(frames, detections)
+        # What the settings say wins.
+        if any(self.config.priors.pose_sigmas):
+            informed = replace(informed, pose_sigma=detections.pose_sigma)
+        if self.config.rig.disparity_sigma_px:
+            informed = replace(informed, offset_sigma_px=detections.offset_sigma_px)
+        return corrected, informed
 
     def _cars(self, frames: FrameBatch, detections: Detections) -> CarBatch:
         return CarBatch.from_scene(frames, detections, self.config.rig.disparity_sigma_px)

@@ -31,7 +31,7 @@ from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import StereoDataset
-from directshape_torch.rig.estimate import FEWEST_CARS, RigEstimate, RigEstimates
+from directshape_torch.rig.estimate import RigEstimate, RigEstimates
 from directshape_torch.rig.from_files import estimate_rigs
 from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, holds_rigs, load_rigs, save_rigs
 from directshape_torch.scene_check.check_scene import check_scene
@@ -155,8 +155,10 @@ def _rigs_of_run(dataset: StereoDataset, rig: str, out_dir: Path, fresh: bool) -
         rigs = estimate_rigs(dataset, lambda _: bar.update())
     for estimate in rigs:
         print(estimate)
-        if 0 < len(estimate.rows) < FEWEST_CARS:
-            few = f"note: so few cars ({len(estimate.rows)}) hardly show the rig, and good boxes may become worse"
+        if len(estimate.rows) and estimate.is_guess:
+            few = (
+                f"note: so few cars ({len(estimate.rows)}) hardly show the rig, so boxes and masks have a say in depths"
+            )
             print(f"{few}: give more frames, or --rig FILE (docs/your_rig.md)", file=sys.stderr)
     return rigs, True
 

@@ -11,7 +11,7 @@ from typing import Any
 from directshape_torch.data_check.check_frame import check_frame
 from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
 from directshape_torch.io.stereo_dataset import StereoDataset
-from directshape_torch.rig.estimate import FEWEST_CARS, RigEstimate, rig_among
+from directshape_torch.rig.estimate import RigEstimate, rig_among
 from directshape_torch.rig.rig import Rig
 from directshape_torch.scene_check.car_evidence import FrameEvidence
 from directshape_torch.scene_check.check_scene import check_cars
@@ -23,6 +23,7 @@ _NAMED = 3
 # 0.15 px are 0.35 m at 30 m on KITTI's rig.
 LARGEST_OFFSET_PX, LARGEST_BIAS = 0.15, 0.03
 _SURE = 2.0  # standard deviations
+_FEWEST_CARS = 10  # of fewer the noise of a detector is a guess
 
 
 def check_dataset(
@@ -112,7 +113,7 @@ def check_rig(dataset: StereoDataset, frame_ids: Sequence[str]) -> list[Finding]
         with suppress(DirectShapeError, OSError):
             loaded = plain.load(frame_id)
             rig_among(rigs, Rig.of_frame(loaded.frame)).update(loaded.frame, loaded.detections)
-    enough = [rig for rig in rigs if len(rig.rows) >= FEWEST_CARS]
+    enough = [rig for rig in rigs if len(rig.rows) >= _FEWEST_CARS]
     return [finding for rig in enough for finding in (*_offset(rig, dataset), *_bias(rig))]
 
 

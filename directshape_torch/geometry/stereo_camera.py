@@ -183,6 +183,14 @@ class StereoCamera(TensorRecord):
         """Distance of the right camera along the left camera's x axis, (F,), metres, positive."""
         return -self.T_right_cam[:, 0, 3]
 
+    @torch.no_grad()
+    def field_sigma_px(self, frame_index: Tensor, points_cam: Tensor) -> Tensor:
+        """Standard deviation (P,) of the disparity field where points (P, 3) of frames (P,) are seen; 0 without one."""
+        if self.disparity_field is None:
+            return torch.zeros_like(points_cam[:, 0])
+        in_image = (self.K_left[frame_index] @ points_cam[..., None])[..., 0]
+        return self.disparity_field.sigma(in_image[:, :2] / in_image[:, 2:].clamp_min(1e-3))
+
     @property
     def T_cam_ref(self) -> Tensor:
         """The frame of labels and result files to the left camera, (F, 4, 4)."""

@@ -22,8 +22,8 @@ from directshape_torch.scene import Detections, FrameBatch
 
 # A service runs for years; so many cars say all that cars can say.
 _MOST_ROWS = 1000
-FEWEST_CARS = 10
-"""Of fewer the noise of a detector, and on a rig like KITTI's the field too, are guesses."""
+# Fewer hardly show a field: the prior decides, and rigs like KITTI's are farther off than it expects.
+_FEWEST_CARS = 30
 
 # No image is wider, and the powers of larger numbers leave a sum no digits.
 _LARGEST_PX = 1e5
@@ -158,20 +158,34 @@ class RigEstimate(nn.Module):
         return replace(frames, camera=replace(frames.camera, disparity_field=self.field))
 
     def informed(self, frames: FrameBatch, detections: Detections) -> Detections:
-        """Detections that say how far the detector's depths are off, where they do not yet.
+        """Detections that say what is not known of the detector's depths and of the rig, where they do not yet.
 
-        What it is off by in the mean counts as much as its noise: the prior stays where the box is. How sure the field
-        is at a car widens what the result says of its depth and does not move it: `Detections.offset_sigma_px` gives
-        depth to the contours, which on KITTI know it less well than a disparity that is off by a quarter of a pixel
-        (docs/your_rig.md).
+        What the detector is off by in the mean counts as much as its noise: the prior stays where the box is. A field
+        that next to nothing shows leaves each car an unknown offset, so that contours and box have a say in its depth.
+        A better one widens what the result says of its depth and does not move it: on KITTI contours know the depth
+        less well than a disparity that is off by a quarter of a pixel (docs/your_rig.md).
+
+        Args:
+            frames: as they came; those that bring a field of their own are not this estimate's.
+            detections: of these frames.
         """
-        if detections.pose_sigma is not None or len(self.rows) < FEWEST_CARS:
-            return detections
         origin = detections.T_cam_obj.detach()[:, :3, 3]
-        along = math.hypot(*self.detector[:3]) * torch.hypot(origin[:, 0], origin[:, 2])
-        sigma = origin.new_full((len(origin), 4), torch.inf)
-        sigma[:, 0] = torch.where(along > 0, along, torch.inf)
-        return replace(detections, pose_sigma=sigma)
+        if detections.pose_sigma is None and len(self.rows):
+            along = math.hypot(*self.detector[:3]) * torch.hypot(origin[:, 0], origin[:, 2])
+            sigma = origin.new_full((len(origin), 4), torch.inf)
+            sigma[:, 0] = torch.where(along > 0, along, torch.inf)
+            detections = replace(detections, pose_sigma=sigma)
+        if detections.offset_sigma_px is None and self.is_guess and frames.camera.disparity_field is None:
+            camera = self.corrected(frames).camera
+            sigma = camera.field_sigma_px(detections.frame_index, origin)
+            # A box that is nowhere fails by itself.
+            detections = replace(detections, offset_sigma_px=sigma.nan_to_num(nan=0.0))
+        return detections
+
+    @property
+    def is_guess(self) -> bool:
+        """Whether the field is hardly more than the prior: fewer than 30 cars, and no other evidence."""
+        return len(self.rows) < _FEWEST_CARS and not self.pixels
 
     def __str__(self) -> str:
         """One line of what was found and from what."""

@@ -40,17 +40,6 @@ class CarState(NamedTuple):
         return 6 + self.code.shape[1] + self.offset_px.shape[1] + self.path.shape[1] + 6 * self.T_obj_next.shape[1]
 
 
-@torch.no_grad()
-def _field_sigma_px(frames: FrameBatch, detections: Detections, offset_sigma_px: Tensor | None) -> Tensor:
-    """Of the disparity field (B,) where the boxes stand, unless an unknown offset stands for it."""
-    origin, field = detections.T_cam_obj[:, :3, 3], frames.camera.disparity_field
-    if field is None:
-        return torch.zeros_like(origin[:, 0])
-    in_image = (frames.camera.K_left[detections.frame_index] @ origin[..., None])[..., 0]
-    sigma = field.sigma(in_image[:, :2] / in_image[:, 2:].clamp_min(1e-3))
-    return sigma if offset_sigma_px is None else sigma.masked_fill(offset_sigma_px > 0, 0.0)
-
-
 def retract(state: CarState, delta: Tensor, max_code: float = torch.inf, max_angle: float = torch.inf) -> CarState:
     """`T_obj_cam <- exp(v, omega) T_obj_cam`, `code <- code + dcode`, bounded, what else there is likewise.
 
@@ -142,6 +131,10 @@ class CarBatch(Record):
             )
         elif not bool((offset_sigma_px > 0).any()):
             offset_sigma_px = None
+        field_sigma_px = frames.camera.field_sigma_px(f, detections.T_cam_obj[:, :3, 3])
+        if offset_sigma_px is not None:
+            # The unknown offset stands for the field.
+            field_sigma_px = field_sigma_px.masked_fill(offset_sigma_px > 0, 0.0)
         return cls(
             detection_row=torch.arange(len(f), device=f.device),
             frame_index=f,
@@ -155,7 +148,7 @@ class CarBatch(Record):
             detector_T_cam_obj=detections.T_cam_obj,
             detector_pose_sigma=detections.pose_sigma,
             offset_sigma_px=offset_sigma_px,
-            field_sigma_px=_field_sigma_px(frames, detections, offset_sigma_px),
+            field_sigma_px=field_sigma_px,
             track_id=detections.track_id,
             has_mask_left=detections.has_mask_left,
             time_s=None if frames.time_s is None else frames.time_s[f],

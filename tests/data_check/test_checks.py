@@ -200,7 +200,7 @@ DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 @pytest.mark.parametrize(("bias_px", "expected"), [(0.0, []), (1.5, ["rig_offset"])])
 def test_a_field_that_the_cars_contradict(bias_px: float, expected: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """The bundled frame is exact, so a field of 1.5 px is what is wrong; it has six cars."""
-    monkeypatch.setattr(module, "FEWEST_CARS", 4)
+    monkeypatch.setattr(module, "_FEWEST_CARS", 4)
     dataset = open_dataset("kitti", DEMO, DEMO / "training" / "label_2", DEMO / "training" / "masks")
     frame = dataset.load("000000").frame
     height, width = frame.sizes[0].tolist()

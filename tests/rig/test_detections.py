@@ -109,7 +109,7 @@ def test_the_refiner_corrects_frames_by_its_rig(demo: LoadedFrame) -> None:
     assert rig.corrected(corrected) is corrected
     config = directshape_torch.load_config("fast", ["stages=[{max_iterations: 1}]"])
     by_rig = DirectShapeRefiner(config=config, rig=rig)(demo.frame, demo.detections)
-    by_camera = DirectShapeRefiner(config=config)(corrected, demo.detections)
+    by_camera = DirectShapeRefiner(config=config)(corrected, rig.informed(demo.frame, demo.detections))
     assert torch.equal(by_rig.T_cam_obj, by_camera.T_cam_obj)
     K_left = demo.frame.camera.K_left.clone()
     K_left[:, 0, 0] += 3

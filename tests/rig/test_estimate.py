@@ -126,7 +126,7 @@ def test_files_and_states_give_it_back(tmp_path: pytest.TempPathFactory) -> None
 
 def test_the_detectors_depth_error_becomes_its_prior_where_nobody_says_another() -> None:
     _, scene = cached_street()
-    rig, few = estimate(rows_of_cars(60, 6)), estimate(rows_of_cars(5, 6))
+    rig = estimate(rows_of_cars(60, 6))
     informed = rig.informed(scene.frames, scene.detections)
     assert informed.pose_sigma is not None
     distance = scene.detections.T_cam_obj[:, 0:3:2, 3].norm(dim=1)
@@ -136,7 +136,30 @@ def test_the_detectors_depth_error_becomes_its_prior_where_nobody_says_another()
     assert informed.pose_sigma[:, 1:].isinf().all()
     own = replace(scene.detections, pose_sigma=torch.ones_like(informed.pose_sigma))
     assert rig.informed(scene.frames, own) is own
-    assert few.informed(scene.frames, scene.detections) is scene.detections
+
+
+def test_a_rig_that_few_cars_show_is_an_unknown_of_each_car() -> None:
+    _, scene = cached_street()
+    frames, d = scene.frames, scene.detections
+    to_size = torch.tensor(scene.frames.sizes[0].tolist()[::-1]) / torch.tensor(SIZE_WH)
+    few, many = RigEstimate.of_frames(frames), RigEstimate.of_frames(frames)
+    for rig, rows in ((few, rows_of_cars(5, 6)), (many, rows_of_cars(60, 6))):
+        rig.add_rows(torch.cat([rows[:, :2] * to_size, rows[:, 2:]], dim=1))
+    nowhere = torch.full_like(d.T_cam_obj[:1], torch.nan)
+    d = replace(d, T_cam_obj=torch.cat([nowhere, d.T_cam_obj[1:]]))
+    sigma = few.informed(frames, d).offset_sigma_px
+    assert sigma is not None
+    seen = (frames.camera.K_left[d.frame_index] @ d.T_cam_obj[:, :3, 3:])[..., 0]
+    torch.testing.assert_close(sigma[1:], few.offset_at(seen[1:, :2] / seen[1:, 2:])[1].to(sigma))
+    assert float(sigma[0]) == 0
+    assert bool((sigma[1:] > 0.1).all())
+    # Not where someone knows better: the caller, a field of the frames, pixels of known depth, more cars, the settings.
+    own = replace(d, offset_sigma_px=torch.full_like(sigma, 0.3))
+    assert few.informed(frames, own).offset_sigma_px is own.offset_sigma_px
+    assert few.informed(few.corrected(frames), d).offset_sigma_px is None
+    assert many.informed(frames, d).offset_sigma_px is None
+    few.add_pixels("lidar", pixel_evidence(true_pixels(), SIZE_WH))
+    assert few.informed(frames, d).offset_sigma_px is None
 
 
 def test_frames_are_taken_evenly_from_all_of_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
