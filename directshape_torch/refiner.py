@@ -195,8 +195,8 @@ class DirectShapeRefiner(nn.Module):
 
     def _with_rig(self, frames: FrameBatch, detections: Detections) -> tuple[FrameBatch, Detections]:
         """The call's inputs, checked, with what is known of the rig and the detector."""
-        corrected = frames if self.rig is None else self.rig.corrected(frames)
-        check_fit(corrected, detections, self.prior)
+        frames = frames if self.rig is None else self.rig.corrected(frames)
+        check_fit(frames, detections, self.prior)
         if self.rig is None:
             return frames, detections
         informed = self.rig.informed(frames, detections)
@@ -205,7 +205,7 @@ class DirectShapeRefiner(nn.Module):
             informed = replace(informed, pose_sigma=detections.pose_sigma)
         if self.config.rig.disparity_sigma_px:
             informed = replace(informed, offset_sigma_px=detections.offset_sigma_px)
-        return corrected, informed
+        return frames, informed
 
     def _cars(self, frames: FrameBatch, detections: Detections) -> CarBatch:
         return CarBatch.from_scene(frames, detections, self.config.rig.disparity_sigma_px)

@@ -166,7 +166,7 @@ class RigEstimate(nn.Module):
         less well than a disparity that is off by a quarter of a pixel (docs/your_rig.md).
 
         Args:
-            frames: as they came; those that bring a field of their own are not this estimate's.
+            frames: corrected; of a field of their own its sigma is taken.
             detections: of these frames.
         """
         origin = detections.T_cam_obj.detach()[:, :3, 3]
@@ -175,9 +175,8 @@ class RigEstimate(nn.Module):
             sigma = origin.new_full((len(origin), 4), torch.inf)
             sigma[:, 0] = torch.where(along > 0, along, torch.inf)
             detections = replace(detections, pose_sigma=sigma)
-        if detections.offset_sigma_px is None and self.is_guess and frames.camera.disparity_field is None:
-            camera = self.corrected(frames).camera
-            sigma = camera.field_sigma_px(detections.frame_index, origin)
+        if detections.offset_sigma_px is None and self.is_guess:
+            sigma = frames.camera.field_sigma_px(detections.frame_index, origin)
             # A box that is nowhere fails by itself.
             detections = replace(detections, offset_sigma_px=sigma.nan_to_num(nan=0.0))
         return detections

@@ -109,8 +109,15 @@ def test_the_refiner_corrects_frames_by_its_rig(demo: LoadedFrame) -> None:
     assert rig.corrected(corrected) is corrected
     config = directshape_torch.load_config("fast", ["stages=[{max_iterations: 1}]"])
     by_rig = DirectShapeRefiner(config=config, rig=rig)(demo.frame, demo.detections)
-    by_camera = DirectShapeRefiner(config=config)(corrected, rig.informed(demo.frame, demo.detections))
+    by_camera = DirectShapeRefiner(config=config)(corrected, rig.informed(corrected, demo.detections))
     assert torch.equal(by_rig.T_cam_obj, by_camera.T_cam_obj)
+    assert "rig" in by_rig.term_names
+    said = directshape_torch.load_config("fast", ["stages=[{max_iterations: 1}]", "rig.disparity_sigma_px=0.9"])
+    by_setting = DirectShapeRefiner(config=said, rig=rig)(demo.frame, demo.detections)
+    of_estimate = rig.informed(corrected, demo.detections)
+    of_setting = replace(of_estimate, offset_sigma_px=None)
+    assert torch.equal(by_setting.T_cam_obj, DirectShapeRefiner(config=said)(corrected, of_setting).T_cam_obj)
+    assert not torch.equal(by_setting.T_cam_obj, by_rig.T_cam_obj)
     K_left = demo.frame.camera.K_left.clone()
     K_left[:, 0, 0] += 3
     other = replace(demo.frame, camera=replace(demo.frame.camera, K_left=K_left))

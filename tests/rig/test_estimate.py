@@ -147,19 +147,18 @@ def test_a_rig_that_few_cars_show_is_an_unknown_of_each_car() -> None:
         rig.add_rows(torch.cat([rows[:, :2] * to_size, rows[:, 2:]], dim=1))
     nowhere = torch.full_like(d.T_cam_obj[:1], torch.nan)
     d = replace(d, T_cam_obj=torch.cat([nowhere, d.T_cam_obj[1:]]))
-    sigma = few.informed(frames, d).offset_sigma_px
+    sigma = few.informed(few.corrected(frames), d).offset_sigma_px
     assert sigma is not None
     seen = (frames.camera.K_left[d.frame_index] @ d.T_cam_obj[:, :3, 3:])[..., 0]
     torch.testing.assert_close(sigma[1:], few.offset_at(seen[1:, :2] / seen[1:, 2:])[1].to(sigma))
     assert float(sigma[0]) == 0
     assert bool((sigma[1:] > 0.1).all())
-    # Not where someone knows better: the caller, a field of the frames, pixels of known depth, more cars, the settings.
+    # Not where someone knows better: the caller, more cars, pixels of known depth.
     own = replace(d, offset_sigma_px=torch.full_like(sigma, 0.3))
-    assert few.informed(frames, own).offset_sigma_px is own.offset_sigma_px
-    assert few.informed(few.corrected(frames), d).offset_sigma_px is None
-    assert many.informed(frames, d).offset_sigma_px is None
+    assert few.informed(few.corrected(frames), own).offset_sigma_px is own.offset_sigma_px
+    assert many.informed(many.corrected(frames), d).offset_sigma_px is None
     few.add_pixels("lidar", pixel_evidence(true_pixels(), SIZE_WH))
-    assert few.informed(frames, d).offset_sigma_px is None
+    assert few.informed(few.corrected(frames), d).offset_sigma_px is None
 
 
 def test_frames_are_taken_evenly_from_all_of_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
