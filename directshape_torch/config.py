@@ -132,8 +132,8 @@ class RigConfig(Settings):
     disparity_sigma_px: float = setting(
         0.0,
         "standard deviation of an unknown offset of the disparity, one for each car, which weighs depth by disparity "
-        "against the size of the silhouettes and the detector's depth: 0 for no such unknown, about 0.1 where a "
-        "residual disparity field was fitted, 0.5 and more where none was",
+        "against the size of the silhouettes and the detector's depth: about 0.1 where a residual disparity field was "
+        "fitted, 0.5 and more where none was; 0 for no such unknown but that of an estimate from few detections",
         at_least=0,
     )
 

@@ -52,8 +52,8 @@ class DirectShapeRefiner(nn.Module):
             tensors move with `.to(...)` and live in the `state_dict`.
         config: settings; default `RefinerConfig()`, the same as `configs/default.yaml`.
         extra_terms: make terms of one's own for the cars of a call (docs/extra_terms.md), beside those of the method.
-        rig: corrects frames that bring no disparity field of their own, and says how good the detector's depths are
-            where nobody else does: a `RigEstimate`, which lives in the `state_dict` too.
+        rig: corrects frames that bring no disparity field of their own, and says how good the detector's depths and
+            its own field are where nobody else does: a `RigEstimate`, which lives in the `state_dict` too.
 
     Raises:
         InputError: a prior without the members or derivatives that `ShapePrior` lists; settings that are no
@@ -203,7 +203,8 @@ class DirectShapeRefiner(nn.Module):
         # What the settings say wins.
         if any(self.config.priors.pose_sigmas):
             informed = replace(informed, pose_sigma=detections.pose_sigma)
-        if self.config.rig.disparity_sigma_px:
+        # Points of stereo clouds know no offset.
+        if self.config.rig.disparity_sigma_px or self.config.method in ("geometric", "combined"):
             informed = replace(informed, offset_sigma_px=detections.offset_sigma_px)
         return frames, informed
 

@@ -117,6 +117,7 @@ def run(args: argparse.Namespace) -> int:
     if rigs:
         dataset = replace(dataset, disparity_fields=tuple(rig.field for rig in rigs))
         refiner.rig = RigEstimates(rigs)
+        _say_where_rigs_are_guesses(rigs)
     with _Progress(args.out, rigs if are_new else None) as progress:
         summary = refine_dataset(dataset, refiner, args.out, options, progress, fresh=args.fresh)
     for warning in summary.warnings:
@@ -155,12 +156,14 @@ def _rigs_of_run(dataset: StereoDataset, rig: str, out_dir: Path, fresh: bool) -
         rigs = estimate_rigs(dataset, lambda _: bar.update())
     for estimate in rigs:
         print(estimate)
-        if len(estimate.rows) and estimate.is_guess:
-            few = (
-                f"note: so few cars ({len(estimate.rows)}) hardly show the rig, so boxes and masks have a say in depths"
-            )
-            print(f"{few}: give more frames, or --rig FILE (docs/your_rig.md)", file=sys.stderr)
     return rigs, True
+
+
+def _say_where_rigs_are_guesses(rigs: Sequence[RigEstimate]) -> None:
+    for estimate in rigs:
+        if estimate.is_guess:
+            few = f"note: {len(estimate.rows)} detections hardly show the rig, so depths by disparity count for less"
+            print(f"{few}: give more frames, or --rig FILE (docs/your_rig.md)", file=sys.stderr)
 
 
 class _Progress(ProgressBar):

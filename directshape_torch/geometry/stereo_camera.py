@@ -185,11 +185,16 @@ class StereoCamera(TensorRecord):
 
     @torch.no_grad()
     def field_sigma_px(self, frame_index: Tensor, points_cam: Tensor) -> Tensor:
-        """Standard deviation (P,) of the disparity field where points (P, 3) of frames (P,) are seen; 0 without one."""
+        """Standard deviation (P,) of the disparity field where points (P, 3) of frames (P,) are seen; 0 without one.
+
+        Of points beyond the image it is that at the border: a polynomial knows nothing there.
+        """
         if self.disparity_field is None:
             return torch.zeros_like(points_cam[:, 0])
         in_image = (self.K_left[frame_index] @ points_cam[..., None])[..., 0]
-        return self.disparity_field.sigma(in_image[:, :2] / in_image[:, 2:].clamp_min(1e-3))
+        u, v = (in_image[:, :2] / in_image[:, 2:].clamp_min(1e-3)).unbind(1)
+        width, height = self.disparity_field.size_wh
+        return self.disparity_field.sigma(torch.stack([u.clamp(0, width - 1), v.clamp(0, height - 1)], dim=1))
 
     @property
     def T_cam_ref(self) -> Tensor:

@@ -161,30 +161,35 @@ class RigEstimate(nn.Module):
         """Detections that say what is not known of the detector's depths and of the rig, where they do not yet.
 
         What the detector is off by in the mean counts as much as its noise: the prior stays where the box is. A field
-        that next to nothing shows leaves each car an unknown offset, so that contours and box have a say in its depth.
-        A better one widens what the result says of its depth and does not move it: on KITTI contours know the depth
-        less well than a disparity that is off by a quarter of a pixel (docs/your_rig.md).
+        that is a guess leaves each car an unknown offset, so that contours and box have a say in its depth. The sigma
+        of a better one widens what the result says of its depth and does not move it: contours would know less.
 
         Args:
-            frames: corrected; of a field of their own its sigma is taken.
+            frames: corrected; what is said of the rig concerns those with this estimate's field.
             detections: of these frames.
         """
         origin = detections.T_cam_obj.detach()[:, :3, 3]
+        said: dict[str, Tensor] = {}
         if detections.pose_sigma is None and len(self.rows):
             along = math.hypot(*self.detector[:3]) * torch.hypot(origin[:, 0], origin[:, 2])
-            sigma = origin.new_full((len(origin), 4), torch.inf)
-            sigma[:, 0] = torch.where(along > 0, along, torch.inf)
-            detections = replace(detections, pose_sigma=sigma)
-        if detections.offset_sigma_px is None and self.is_guess:
+            said["pose_sigma"] = origin.new_full((len(origin), 4), torch.inf)
+            said["pose_sigma"][:, 0] = torch.where(along > 0, along, torch.inf)
+        if detections.offset_sigma_px is None and self.is_guess and self._is_own(frames.camera.disparity_field):
             sigma = frames.camera.field_sigma_px(detections.frame_index, origin)
             # A box that is nowhere fails by itself.
-            detections = replace(detections, offset_sigma_px=sigma.nan_to_num(nan=0.0))
-        return detections
+            said["offset_sigma_px"] = sigma.nan_to_num(nan=0.0)
+        return replace(detections, **said) if said else detections  # type: ignore[arg-type]
 
     @property
     def is_guess(self) -> bool:
-        """Whether the field is hardly more than the prior: fewer than 30 cars, and no other evidence."""
+        """Whether the field is hardly more than the prior: from fewer than 30 detections, and no other evidence."""
         return len(self.rows) < _FEWEST_CARS and not self.pixels
+
+    def _is_own(self, field: DisparityField | None) -> bool:
+        if field is None:
+            return False
+        own = self.field.coefficients.to(field.coefficients.dtype)
+        return torch.equal(field.coefficients.cpu(), own)
 
     def __str__(self) -> str:
         """One line of what was found and from what."""

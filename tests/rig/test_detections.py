@@ -118,6 +118,14 @@ def test_the_refiner_corrects_frames_by_its_rig(demo: LoadedFrame) -> None:
     of_setting = replace(of_estimate, offset_sigma_px=None)
     assert torch.equal(by_setting.T_cam_obj, DirectShapeRefiner(config=said)(corrected, of_setting).T_cam_obj)
     assert not torch.equal(by_setting.T_cam_obj, by_rig.T_cam_obj)
+    of_settings = directshape_torch.load_config("fast", ["stages=[{max_iterations: 1}]", "priors.pose_sigma_yaw_deg=1"])
+    by_camera = DirectShapeRefiner(config=of_settings)(corrected, replace(of_estimate, pose_sigma=None))
+    assert torch.equal(
+        DirectShapeRefiner(config=of_settings, rig=rig)(demo.frame, demo.detections).T_cam_obj, by_camera.T_cam_obj
+    )
+    # A stereo cloud knows no offset, so its covariance keeps the field's part.
+    of_cloud = directshape_torch.load_config("default", ["method=geometric", "point_cloud.rounds=1"])
+    assert "rig" not in DirectShapeRefiner(config=of_cloud, rig=rig)(demo.frame, demo.detections).term_names
     K_left = demo.frame.camera.K_left.clone()
     K_left[:, 0, 0] += 3
     other = replace(demo.frame, camera=replace(demo.frame.camera, K_left=K_left))

@@ -21,6 +21,7 @@ from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.rig.from_files import estimate_rigs
 from directshape_torch.rig.pixels import pixel_evidence
 from directshape_torch.rig.rig_file import load_fields, load_rigs, save_field, save_rigs
+from directshape_torch.scene import Detections
 
 PLACES = torch.tensor([[200.0, 190], [450, 190], [620, 190], [800, 190], [1050, 190]], dtype=torch.float64)
 
@@ -141,24 +142,47 @@ def test_the_detectors_depth_error_becomes_its_prior_where_nobody_says_another()
 def test_a_rig_that_few_cars_show_is_an_unknown_of_each_car() -> None:
     _, scene = cached_street()
     frames, d = scene.frames, scene.detections
-    to_size = torch.tensor(scene.frames.sizes[0].tolist()[::-1]) / torch.tensor(SIZE_WH)
-    few, many = RigEstimate.of_frames(frames), RigEstimate.of_frames(frames)
-    for rig, rows in ((few, rows_of_cars(5, 6)), (many, rows_of_cars(60, 6))):
+    to_size = torch.tensor(frames.sizes[0].tolist()[::-1]) / torch.tensor(SIZE_WH)
+
+    def informed(rig: RigEstimate, detections: Detections) -> Detections:
+        return rig.informed(rig.corrected(frames), detections)
+
+    def of_cars(count: int) -> RigEstimate:
+        rig, rows = RigEstimate.of_frames(frames), rows_of_cars(count, 6)
         rig.add_rows(torch.cat([rows[:, :2] * to_size, rows[:, 2:]], dim=1))
-    nowhere = torch.full_like(d.T_cam_obj[:1], torch.nan)
+        return rig
+
+    few, nowhere = of_cars(29), torch.full_like(d.T_cam_obj[:1], torch.nan)
     d = replace(d, T_cam_obj=torch.cat([nowhere, d.T_cam_obj[1:]]))
-    sigma = few.informed(few.corrected(frames), d).offset_sigma_px
+    sigma = informed(few, d).offset_sigma_px
     assert sigma is not None
     seen = (frames.camera.K_left[d.frame_index] @ d.T_cam_obj[:, :3, 3:])[..., 0]
     torch.testing.assert_close(sigma[1:], few.offset_at(seen[1:, :2] / seen[1:, 2:])[1].to(sigma))
     assert float(sigma[0]) == 0
-    assert bool((sigma[1:] > 0.1).all())
-    # Not where someone knows better: the caller, more cars, pixels of known depth.
+    assert informed(few, d).pose_sigma is not None
+    fresh = informed(RigEstimate.of_frames(frames), d)
+    assert fresh.pose_sigma is None
+    assert fresh.offset_sigma_px is not None
+    # Not where someone knows better: the caller, a field of the frames, more cars, pixels of known depth.
     own = replace(d, offset_sigma_px=torch.full_like(sigma, 0.3))
-    assert few.informed(few.corrected(frames), own).offset_sigma_px is own.offset_sigma_px
-    assert many.informed(many.corrected(frames), d).offset_sigma_px is None
+    assert informed(few, own).offset_sigma_px is own.offset_sigma_px
+    assert few.informed(frames, d).offset_sigma_px is None
+    assert few.informed(of_cars(28).corrected(frames), d).offset_sigma_px is None
+    assert informed(of_cars(30), d).offset_sigma_px is None
     few.add_pixels("lidar", pixel_evidence(true_pixels(), SIZE_WH))
-    assert few.informed(few.corrected(frames), d).offset_sigma_px is None
+    assert informed(few, d).offset_sigma_px is None
+
+
+def test_beyond_the_image_a_field_is_as_sure_as_at_its_border() -> None:
+    _, scene = cached_street()
+    camera = RigEstimate.of_frames(scene.frames).corrected(scene.frames).camera
+    width = int(scene.frames.sizes[0, 1])
+    axis, border = camera.K_left[0, 0, 2], width - 1 - camera.K_left[0, 0, 2]
+    x = torch.stack([border, 5 * border, axis]) / camera.K_left[0, 0, 0]
+    points = torch.stack([x, torch.zeros(3), torch.tensor([1.0, 1.0, -1.0])], dim=1)
+    sigma = camera.field_sigma_px(torch.zeros(3, dtype=torch.long), points)
+    torch.testing.assert_close(sigma[1], sigma[0])
+    assert float(sigma[2]) < 2
 
 
 def test_frames_are_taken_evenly_from_all_of_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
