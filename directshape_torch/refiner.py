@@ -203,8 +203,8 @@ class DirectShapeRefiner(nn.Module):
         # What the settings say wins.
         if any(self.config.priors.pose_sigmas):
             informed = replace(informed, pose_sigma=detections.pose_sigma)
-        # Points of stereo clouds know no offset.
-        if self.config.rig.disparity_sigma_px or self.config.method in ("geometric", "combined"):
+        # The other methods' points and boxes know no offset.
+        if self.config.rig.disparity_sigma_px or self.config.method != "direct":
             informed = replace(informed, offset_sigma_px=detections.offset_sigma_px)
         return frames, informed
 

@@ -18,6 +18,7 @@ from directshape_torch.export.export_run import FORMATS, export_run
 from directshape_torch.export.frame_source import ExportOptions
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.rig.estimate import RigEstimates
 from directshape_torch.rig.rig_file import known_rigs
 from directshape_torch.visualize.run_frames import RunInputs
 
@@ -80,4 +81,4 @@ def _make_refiner(args: argparse.Namespace, inputs: RunInputs) -> DirectShapeRef
     if inputs.prior is None:
         raise InputError("--prior", "the shape prior of the run", "nothing")
     config = replace(inputs.run.refiner_config(), compile="off")
-    return DirectShapeRefiner(inputs.prior, config, rig=known_rigs(args.rig))
+    return DirectShapeRefiner(inputs.prior, config, rig=RigEstimates(known_rigs(args.rig)))

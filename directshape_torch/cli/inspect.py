@@ -25,6 +25,7 @@ from directshape_torch.io.kitti_labels import box_corners_cam
 from directshape_torch.io.result_files import track_name
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.rig.estimate import RigEstimates
 from directshape_torch.rig.rig_file import known_rigs
 from directshape_torch.visualize.car_figures import (
     CarCourse,
@@ -64,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     dataset = _dataset(args)
     # One frame is not worth a compilation, and pictures need no graphics card.
     refiner = make_refiner(args.config, ["compile=off", *args.set], args.prior, "cpu")
-    refiner.rig = known_rigs(args.rig)
+    refiner.rig = RigEstimates(known_rigs(args.rig))
     if args.tracks:
         if not inspect_tracks([dataset.load(frame_id) for frame_id in dataset.frame_ids], refiner, args.out):
             raise InputError("--tracks", "a car in several of these frames", "none", "give more --frames")

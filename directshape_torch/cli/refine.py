@@ -33,7 +33,7 @@ from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.rig.estimate import RigEstimate, RigEstimates
 from directshape_torch.rig.from_files import estimate_rigs
-from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, holds_rigs, load_rigs, save_rigs
+from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, known_rigs, load_rigs, save_rigs
 from directshape_torch.scene_check.check_scene import check_scene
 from directshape_torch.terms.lidar import LidarPoints
 from directshape_torch.visualize.rig_picture import draw_rigs
@@ -117,7 +117,8 @@ def run(args: argparse.Namespace) -> int:
     if rigs:
         dataset = replace(dataset, disparity_fields=tuple(rig.field for rig in rigs))
         refiner.rig = RigEstimates(rigs)
-        _say_where_rigs_are_guesses(rigs)
+        if refiner.config.method == "direct":
+            _say_where_rigs_are_guesses(rigs)
     with _Progress(args.out, rigs if are_new else None) as progress:
         summary = refine_dataset(dataset, refiner, args.out, options, progress, fresh=args.fresh)
     for warning in summary.warnings:
@@ -144,7 +145,7 @@ def _rigs_of_run(dataset: StereoDataset, rig: str, out_dir: Path, fresh: bool) -
     """The estimates that `--rig` names, and whether they are new: those of a file, or of the run's folder, made where
     there are none."""
     if rig != "auto":
-        return load_rigs(rig) if rig != "none" and holds_rigs(rig) else [], False
+        return known_rigs(rig), False
     path = out_dir / RIG_FILE
     # Whatever lies there is not overwritten, unless it is an estimate.
     kept = load_rigs(path) if path.is_file() else None

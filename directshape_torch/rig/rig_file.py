@@ -10,7 +10,7 @@ from directshape_torch.errors import DataFormatError, InputError, shown
 from directshape_torch.files.atomic_files import write_json
 from directshape_torch.files.read_files import read_json
 from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, TENSOR_SHAPES, DisparityField
-from directshape_torch.rig.estimate import RigEstimate, RigEstimates, to_tensor
+from directshape_torch.rig.estimate import RigEstimate, to_tensor
 
 # In the folder of a run.
 RIG_FILE, RIG_PICTURE = "rig.json", "rig.png"
@@ -69,9 +69,9 @@ def load_fields(path: Path | str) -> tuple[DisparityField, ...]:
     return tuple(rig.field for rig in load_rigs(path)) if holds_rigs(path) else (load_field(path),)
 
 
-def known_rigs(path: Path | str) -> RigEstimates | None:
-    """What a refiner takes of the file that `--rig` names; None for "none", and for a field without its evidence."""
-    return RigEstimates(load_rigs(path)) if path != "none" and holds_rigs(path) else None
+def known_rigs(name: str) -> list[RigEstimate]:
+    """The estimates that `--rig` names by their file; nothing of "none", or of a field without its evidence."""
+    return load_rigs(name) if name != "none" and holds_rigs(name) else []
 
 
 def holds_rigs(path: Path | str) -> bool:

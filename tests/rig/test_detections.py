@@ -111,24 +111,29 @@ def test_the_refiner_corrects_frames_by_its_rig(demo: LoadedFrame) -> None:
     by_rig = DirectShapeRefiner(config=config, rig=rig)(demo.frame, demo.detections)
     by_camera = DirectShapeRefiner(config=config)(corrected, rig.informed(corrected, demo.detections))
     assert torch.equal(by_rig.T_cam_obj, by_camera.T_cam_obj)
-    assert "rig" in by_rig.term_names
-    said = directshape_torch.load_config("fast", ["stages=[{max_iterations: 1}]", "rig.disparity_sigma_px=0.9"])
-    by_setting = DirectShapeRefiner(config=said, rig=rig)(demo.frame, demo.detections)
-    of_estimate = rig.informed(corrected, demo.detections)
-    of_setting = replace(of_estimate, offset_sigma_px=None)
-    assert torch.equal(by_setting.T_cam_obj, DirectShapeRefiner(config=said)(corrected, of_setting).T_cam_obj)
-    assert not torch.equal(by_setting.T_cam_obj, by_rig.T_cam_obj)
-    of_settings = directshape_torch.load_config("fast", ["stages=[{max_iterations: 1}]", "priors.pose_sigma_yaw_deg=1"])
-    by_camera = DirectShapeRefiner(config=of_settings)(corrected, replace(of_estimate, pose_sigma=None))
-    assert torch.equal(
-        DirectShapeRefiner(config=of_settings, rig=rig)(demo.frame, demo.detections).T_cam_obj, by_camera.T_cam_obj
-    )
-    # A stereo cloud knows no offset, so its covariance keeps the field's part.
-    of_cloud = directshape_torch.load_config("default", ["method=geometric", "point_cloud.rounds=1"])
-    assert "rig" not in DirectShapeRefiner(config=of_cloud, rig=rig)(demo.frame, demo.detections).term_names
     K_left = demo.frame.camera.K_left.clone()
     K_left[:, 0, 0] += 3
     other = replace(demo.frame, camera=replace(demo.frame.camera, K_left=K_left))
     for use in (rig.corrected, lambda frames: rig.update(frames, demo.detections)):
         with pytest.raises(InputError, match="a difference of 3 px; estimate this rig"):
             use(other)
+
+
+def test_what_an_estimate_of_few_cars_says_gives_way_to_settings_and_methods(demo: LoadedFrame) -> None:
+    rig = RigEstimate.of_frames(demo.frame)
+    rig.update(demo.frame, demo.detections)
+    frames, plain = rig.corrected(demo.frame), demo.detections
+    informed = rig.informed(frames, plain)
+    for config, heard in (
+        (["priors.pose_sigma_yaw_deg=1"], replace(informed, pose_sigma=None)),
+        (["rig.disparity_sigma_px=0.9"], replace(informed, offset_sigma_px=None)),
+        # Its points know no offset: the covariance keeps what it owes to the field.
+        (["method=geometric", "point_cloud.rounds=1"], replace(informed, offset_sigma_px=None)),
+    ):
+        once = ["stages=[{max_iterations: 1}]", "acceptance.min_probability_better=0"]
+        settings = directshape_torch.load_config("fast", [*once, *config])
+        by_rig = DirectShapeRefiner(config=settings, rig=rig)(demo.frame, plain)
+        expected, other = (DirectShapeRefiner(config=settings)(frames, d) for d in (heard, informed))
+        torch.testing.assert_close(by_rig.covariance, expected.covariance, rtol=0, atol=0, equal_nan=True)
+        assert not bool(torch.isclose(by_rig.covariance, other.covariance).all())
+        assert bool(by_rig.refined.any())

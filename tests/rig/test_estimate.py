@@ -22,6 +22,7 @@ from directshape_torch.rig.from_files import estimate_rigs
 from directshape_torch.rig.pixels import pixel_evidence
 from directshape_torch.rig.rig_file import load_fields, load_rigs, save_field, save_rigs
 from directshape_torch.scene import Detections
+from directshape_torch.terms.cars import CarBatch
 
 PLACES = torch.tensor([[200.0, 190], [450, 190], [620, 190], [800, 190], [1050, 190]], dtype=torch.float64)
 
@@ -159,6 +160,8 @@ def test_a_rig_that_few_cars_show_is_an_unknown_of_each_car() -> None:
     seen = (frames.camera.K_left[d.frame_index] @ d.T_cam_obj[:, :3, 3:])[..., 0]
     torch.testing.assert_close(sigma[1:], few.offset_at(seen[1:, :2] / seen[1:, 2:])[1].to(sigma))
     assert float(sigma[0]) == 0
+    # It stands for the field's sigma, which would else count twice.
+    assert not bool(CarBatch.from_scene(few.corrected(frames), informed(few, d)).field_sigma_px[1:].any())
     assert informed(few, d).pose_sigma is not None
     fresh = informed(RigEstimate.of_frames(frames), d)
     assert fresh.pose_sigma is None
