@@ -23,7 +23,7 @@ from directshape_torch.scene import Detections, FrameBatch
 # A service runs for years; so many cars say all that cars can say.
 _MOST_ROWS = 1000
 # Fewer hardly show a field: the prior decides, and rigs like KITTI's are farther off than it expects.
-_FEWEST_CARS = 30
+_FEWEST_DETECTIONS = 30
 
 # No image is wider, and the powers of larger numbers leave a sum no digits.
 _LARGEST_PX = 1e5
@@ -183,7 +183,7 @@ class RigEstimate(nn.Module):
     @property
     def is_guess(self) -> bool:
         """Whether the field is hardly more than the prior: from fewer than 30 detections, and no other evidence."""
-        return len(self.rows) < _FEWEST_CARS and not self.pixels
+        return len(self.rows) < _FEWEST_DETECTIONS and not self.pixels
 
     def _is_own(self, field: DisparityField | None) -> bool:
         if field is None:
