@@ -4,7 +4,7 @@ Estimate by how much disparities are off over the images of a stereo rig, and th
 refine --rig FILE'. 'refine' does this by itself from detections (docs/your_rig.md); here other evidence joins them:
 LiDAR scans (training/velodyne), disparity maps (training/disp_noc_0 or disp_occ_0), or consecutive frames of a car that
 drives past still things ('motion': ROOT is one sequence with image_02, image_03 and calib.txt, as in KITTI's tracking
-benchmark). Detections are taken from all frames, whichever are chosen. All kinds add up, those in the file of --rig too.
+benchmark). Detections are taken from all frames, whichever are chosen. All kinds add up, those of --rig too.
 """
 
 from __future__ import annotations
