@@ -27,7 +27,7 @@ from torch import Tensor
 
 from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.errors import InputError
-from directshape_torch.refinement import outcome, tracks
+from directshape_torch.refinement import one_car, outcome, tracks
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.quality import EVIDENCE_NAMES
 from directshape_torch.refinement.result import RefinementResult
@@ -144,13 +144,39 @@ def test_the_order_of_the_detections_does_not_matter() -> None:
 
 def test_a_track_of_two_cars_is_split_where_they_were_swapped(monkeypatch: pytest.MonkeyPatch) -> None:
     # The few pixels of a toy know its shape less well than those of a street.
-    monkeypatch.setattr(tracks, "_MOST_SAVED", 3.0)
+    monkeypatch.setattr(one_car, "_MOST_EVIDENCE", 3.0)
     _, detections, _ = drive(contrast=2.5)
     right, swapped = (refined(detections, ids, contrast=2.5) for ids in ([0, 1] * 3, [0, 1, 0, 1, 1, 0]))
     assert right.track_part.tolist() == [0] * 6
     assert swapped.track_part.tolist() == [0] * 4 + [-1] * 2
     alone = refined(detections, [-1] * 6, contrast=2.5)
     assert torch.equal(swapped.code[4:], alone.code[4:])
+
+
+def calm_drive() -> tuple[FrameBatch, Detections]:
+    """Four frames of two cars of one shape and different paint."""
+    code = torch.tensor([[0.9, -0.4, 0.5]] * 2, dtype=torch.float64)
+    height = CAMERA_HEIGHT_M
+    seen = [
+        street(ellipsoid_prior(), [(-1.6, height, 8.0 + 0.3 * n), (1.8, height, 8.5)], [-1.2 + 0.1 * n, -1.0], code)
+        for n in range(4)
+    ]
+    detections = joined_detections([view.detections for view in seen], (120, 160))
+    return joined_frames([view.frames for view in seen]), disturbed(detections, metres=0.05, radians=0.02)
+
+
+@pytest.mark.parametrize("next_view_weight", [0.15, 0.0])
+def test_two_cars_of_one_shape_are_told_apart_by_their_looks(next_view_weight: float) -> None:
+    frames, detections = calm_drive()
+    config = replace(DEFAULT, tracks=replace(DEFAULT.tracks, next_view_weight=next_view_weight))
+    refiner = DirectShapeRefiner(ellipsoid_prior(), config)
+    parts = [
+        refiner(frames, replace(detections, track_id=torch.tensor(ids))).track_part.tolist()
+        for ids in ([0, 1] * 4, [0, 1, 0, 1, 1, 0, 1, 0])
+    ]
+    assert parts[0] == [0] * 8
+    # Without a look at the next view the shapes alone do not tell.
+    assert parts[1] == ([0] * 4 + [1] * 4 if next_view_weight else [0] * 8)
 
 
 def test_a_view_without_a_mask_touches_nothing_else() -> None:

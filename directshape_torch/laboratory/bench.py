@@ -14,9 +14,10 @@ from directshape_torch.laboratory.regimes import Draw, Regime, seeded
 from directshape_torch.laboratory.scenes import LaboratoryScene
 from directshape_torch.numerics.tensors import length, occurrences
 from directshape_torch.observation.packing import Observation, pack_pixels
+from directshape_torch.refinement.one_car import own_and_shared
 from directshape_torch.refinement.problem import CarProblem, CarStage
 from directshape_torch.refinement.scene_problem import TermFactory, problem_of_scene
-from directshape_torch.refinement.tracks import in_tracks, own_and_shared
+from directshape_torch.refinement.tracks import in_tracks
 from directshape_torch.rows import PixelSamples, PointSamples, Rays, Rows
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.pca_prior import PCAShapePrior

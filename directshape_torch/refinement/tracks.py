@@ -1,7 +1,8 @@
 """Cars refined by themselves, then the views of each track together: one shape, and steps in common.
 
 So a view that is not trusted by itself never joins a track, one that is not trusted in it keeps what it was alone, and
-what each says of the shape is known before they are made to agree: a track of two cars is split.
+what each says of the shape is known before they are made to agree. Whether a track is of one car is known once its
+views are together: if it is not, they are brought together again in parts.
 """
 
 from __future__ import annotations
@@ -11,14 +12,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from directshape_torch.refinement.one_car import SaidOfShape, own_and_shared, parts_of_tracks, unlikeness
 from directshape_torch.refinement.outcome import at_states, going_on, judged, outcome_of
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.result import RefinementResult
-from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.differentiate import implicit_state, unrolled_state
 from directshape_torch.solver.gauss_newton import Minimum, minimise
 from directshape_torch.solver.problem import put_rows, take_rows
-from directshape_torch.solver.sharing import Groups, said_of_shared
+from directshape_torch.solver.sharing import Groups
 from directshape_torch.status import Status, is_refined
 from directshape_torch.terms.cars import CarBatch, CarState, following, retract
 from directshape_torch.terms.motion import NUM_PATH, hold_of_path, motion_terms, timed, with_path
@@ -26,9 +27,6 @@ from directshape_torch.terms.next_view import NextView, NextViews
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.term import Term
 
-# Two parts of a track are of one car unless shapes of their own save more than this, twice the cost: of a
-# hundred tracks on which this was tried one shape costs 8.1 at most.
-_MOST_SAVED = 9.0
 # Of a track, times those of the last stage.
 _MORE_ITERATIONS = 2
 # Errors of two views of one rendered car, each refined by itself, correlate by 0.5 in depth, 0.3 across and 0.8 in
@@ -51,9 +49,13 @@ def refined(
     unroll = torch.is_grad_enabled() and problem.config.backward.mode == "unroll"
     minimum, found = _judged(problem, cars, initial, start, came)
     origin = following(initial, start) if unroll else start
-    joins = is_refined(minimum.status)
+    if cars.track_id is None:
+        return at_states(found, _attached(problem, cars, origin, minimum))
+    says = SaidOfShape.at(problem, minimum)
+    joins, unlike = is_refined(minimum.status) & says.anything, torch.zeros_like(minimum.after.cost)
+    parts = parts_of_tracks(cars, says, joins, unlike)
     while True:
-        shared = together(problem, cars, minimum, joins)
+        shared = together(problem, cars, minimum, parts)
         if shared is None:
             return at_states(found, _attached(problem, cars, origin, minimum))
         views, rows = cars.of_cars(shared.keep), shared.keep.nonzero()[:, 0]
@@ -61,10 +63,12 @@ def refined(
         before = shared.linked(take_rows(initial, rows))
         in_track, of_track = _judged(shared.problem, views, before, agreed, came.rows(rows))
         left = (in_track.status == Status.singular.code) | (in_track.status == Status.non_finite.code)
-        if not bool(left.any()):
+        joins = joins.index_fill(0, rows[left], False)
+        unlike = unlike.index_put((rows,), torch.maximum(unlike[rows], shared.unlike_next(in_track)))
+        tried, parts = parts, parts_of_tracks(cars, says, joins, unlike)
+        if parts == tried:
             break
         # What the others know once they know without it: from the beginning.
-        joins = joins.index_fill(0, rows[left], False)
     chosen = is_refined(in_track.status).nonzero()[:, 0]
     if not unroll:
         # What they were alone has no part in their gradients.
@@ -149,93 +153,46 @@ class Together:
             state = state._replace(T_obj_next=state.T_obj_cam[self.next_view][:, None])
         return with_path(self.problem.config.tracks, self.agreement, self.cars, state)
 
+    def unlike_next(self, minimum: Minimum[CarState]) -> Tensor:
+        """How unlike (R,) the next view of their part those views are that are least like it, 0 for the others."""
+        term = next((term for term in minimum.stage.terms if isinstance(term, NextView)), None)
+        if term is None:
+            return torch.zeros_like(minimum.after.cost)
+        unlike = unlikeness(term, minimum.seen_end, self.cars, self.next_view)
+        # Where two cars are made one, their other views suffer too.
+        return torch.where(unlike == self.agreement.largest(unlike, self.agreement.everybody), unlike, 0.0)
+
     def part_of(self, status: Tensor) -> Tensor:
         """The part of its track (R,), -1 for a view that ends with a shape of its own: no other was refined."""
         is_in = is_refined(status)
         return torch.where(self.agreement.total(is_in.to(torch.float64), is_in) > 1, self.part, -1)
 
 
-def together(problem: CarProblem, cars: CarBatch, minimum: Minimum[CarState], joins: Tensor) -> Together | None:
-    """Which of B cars share a shape, of those that join (B,) once refined by themselves; None where nobody does."""
-    if cars.track_id is None:
-        return None
-    hessian = minimum.after.hessian.sum(dim=1)
-    _, solvable = damped_step(hessian, hessian[:, 0], torch.zeros_like(minimum.after.cost))
-    own, shared = own_and_shared(problem, hessian.device)
-    # All slopes of a minimum add up to nothing.
-    A, _, has_any = said_of_shared(hessian, torch.zeros_like(hessian[:, 0]), own, shared)
-    says = _Quadratics(A, A @ minimum.end.code.to(A)[:, :, None])
+def together(
+    problem: CarProblem, cars: CarBatch, minimum: Minimum[CarState], parts: list[list[list[int]]]
+) -> Together | None:
+    """The views (rows of B cars) of each part of each track; None where nobody shares a shape."""
     # Of each view its group, its place there, the view in the next place, and the number of the part of its track.
     views_of_parts: dict[int, tuple[int, int, int, int]] = {}
-    for views in _tracks(cars, joins & solvable & has_any):
-        for number, part in enumerate(_of_one_car(views, says)):
+    for parts_of_track in parts:
+        for number, part in enumerate(parts_of_track):
             if len(part) > 1:
                 followers = [*part[1:], part[-1]]
                 views_of_parts |= {row: (part[0], k, followers[k], number) for k, row in enumerate(part)}
     if not views_of_parts:
         return None
     numbers = sorted(views_of_parts)
-    group, place, after, parts = zip(*(views_of_parts[row] for row in numbers), strict=True)
-    index = torch.tensor(numbers, device=hessian.device)
-    keep = torch.zeros_like(solvable).index_fill(0, index, True)
+    group, place, after, of_part = zip(*(views_of_parts[row] for row in numbers), strict=True)
+    index = torch.tensor(numbers, device=minimum.status.device)
+    keep = torch.zeros_like(minimum.status, dtype=torch.bool).index_fill(0, index, True)
+    own, shared = own_and_shared(problem, keep.device)
     sharing = Groups.of(group, own, shared, place=place)
-    part_number = torch.tensor(parts, device=hessian.device)
-    next_view = torch.tensor([numbers.index(row) for row in after], device=hessian.device)
+    part_number = torch.tensor(of_part, device=keep.device)
+    next_view = torch.tensor([numbers.index(row) for row in after], device=keep.device)
     timed_views = timed(sharing, cars.of_cars(keep))
     of_track = in_tracks(problem.of_problems(keep), sharing, timed_views, take_rows(minimum.end, index), next_view)
-    return Together(keep, of_track, sharing, timed_views, hessian[index], part_number, next_view)
-
-
-def own_and_shared(problem: CarProblem, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Numbers of a view's own unknowns, and of those of the shape."""
-    number = torch.arange(6 + problem.prior.num_codes + problem.num_offsets, device=device)
-    of_shape = (number >= 6) & (number < 6 + problem.prior.num_codes)
-    return number[~of_shape], number[of_shape]
-
-
-def _tracks(cars: CarBatch, usable: Tensor) -> list[list[int]]:
-    """Rows of the usable views of each track, in the order of their times, or of the frames."""
-    assert cars.track_id is not None
-    views: dict[int, list[int]] = {}
-    order = (cars.frame_index if cars.time_s is None else cars.time_s).argsort(stable=True).tolist()
-    track_id, is_usable = cars.track_id.tolist(), usable.tolist()
-    for row in order:
-        if track_id[row] >= 0 and is_usable[row]:
-            views.setdefault(track_id[row], []).append(row)
-    return list(views.values())
-
-
-@dataclass(frozen=True)
-class _Quadratics:
-    """What each of B views says of its code about where it ended, its pose following: `c^T A c / 2 - b^T c`."""
-
-    A: Tensor  # (B, K, K)
-    b: Tensor  # (B, K, 1)
-
-    def saved(self, views: list[int]) -> list[float]:
-        """Twice the cost that is saved if before and after each cut in time have a shape of their own."""
-        index = torch.tensor(views, device=self.A.device)
-        A, b = (x.index_select(0, index).cumsum(dim=0) for x in (self.A, self.b))
-
-        def twice_least(A: Tensor, b: Tensor) -> Tensor:
-            solution: Tensor = torch.linalg.solve_ex(A, b)[0]
-            return -(b * solution).sum(dim=(1, 2))
-
-        together = twice_least(A[-1:], b[-1:])
-        halves = twice_least(A[:-1], b[:-1]) + twice_least(A[-1] - A[:-1], b[-1] - b[:-1])
-        saved: list[float] = (together - halves).tolist()
-        return saved
-
-
-def _of_one_car(views: list[int], says: _Quadratics) -> list[list[int]]:
-    """The views (rows of a track), cut in time where one shape before and after costs most, if that is too much."""
-    if len(views) < 2:
-        return [views]
-    saved = says.saved(views)
-    cut = max(range(len(saved)), key=saved.__getitem__)
-    if not saved[cut] > _MOST_SAVED:
-        return [views]
-    return _of_one_car(views[: cut + 1], says) + _of_one_car(views[cut + 1 :], says)
+    hessian = minimum.after.hessian.sum(dim=1)[index]
+    return Together(keep, of_track, sharing, timed_views, hessian, part_number, next_view)
 
 
 def in_tracks(problem: CarProblem, sharing: Groups, views: CarBatch, alone: CarState, next_view: Tensor) -> CarProblem:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import NamedTuple
 
 import torch
@@ -17,9 +18,9 @@ from torch import Tensor
 
 from directshape_torch.config import StageConfig
 from directshape_torch.geometry import se3
-from directshape_torch.image.interpolate import bilinear_patch
+from directshape_torch.image.interpolate import BilinearPatch, bilinear_patch
 from directshape_torch.numerics.tensors import constant_like, cross
-from directshape_torch.rows import Blocks
+from directshape_torch.rows import Blocks, CarSums
 from directshape_torch.shape.field import Field
 from directshape_torch.terms import robust
 from directshape_torch.terms.cars import CarBatch, CarState
@@ -38,6 +39,8 @@ from directshape_torch.terms.term import Linear, Sight, Term
 NEXT_VIEW_NAME = "next_view"
 # What is not so far in front of the next camera is not seen by it.
 _LEAST_DEPTH_M = 0.1
+# An edge that is three pixels off no longer lies on itself.
+_MOST_SHIFT_PX = 3
 
 
 class NextViews(NamedTuple):
@@ -63,6 +66,11 @@ class NextImage(NamedTuple):
     K: Tensor  # (M, 3, 3) of the next camera, at the level
     grey: Tensor  # (M, 64) of the pixels, brought to the brightness of the next image
     weight: Tensor  # (M, 64) of the pixels; zero for those that the next view does not show
+
+    def at(self, u: Tensor, v: Tensor) -> BilinearPatch:
+        """The image at points (M, 64) at the level."""
+        first_pixel, row_step, last_column, last_row = self.frame.mT[..., None]
+        return bilinear_patch(self.pixels, first_pixel, row_step, u, v, last_column, last_row)
 
 
 class LookedUp(NamedTuple):
@@ -151,8 +159,7 @@ class NextView(Term):
         in_front = z > _LEAST_DEPTH_M
         inverse_z = 1 / torch.where(in_front, z, 1.0)
         u, v = x * inverse_z, y * inverse_z
-        first_pixel, row_step, last_column, last_row = image.frame.mT[..., None]
-        at = bilinear_patch(image.pixels, first_pixel, row_step, u, v, last_column, last_row)
+        at = image.at(u, v)
         J_u, J_v = ((P[n] - w * P[2]) * inverse_z for n, w in ((0, u), (1, v)))
         return LookedUp(u, v, at.value, at.d_u * J_u + at.d_v * J_v, at.inside & in_front)
 
@@ -186,6 +193,32 @@ class NextView(Term):
 
     def norm(self, residual: Tensor) -> robust.RobustValue:
         return photometric_norm(self.stereo.config, residual)
+
+    def likeness(self, sight: Sight) -> tuple[Tensor, Tensor]:
+        """How alike (B,) each view and the next are: the correlation of the grey levels of the pixels seen in both.
+
+        The largest one with the next image moved by up to `_MOST_SHIFT_PX`: views that lie a little beside each other
+        are of one car all the same. Behind it how many pixels (B,) are seen in both.
+        """
+        where, owner, image = self.where(sight), self.blocks.owner, self.image
+        at = self._looked_up(sight.state, where.points_obj)
+        in_both = (where.usable & at.inside & (image.weight > 0)).to(torch.float64)
+        sums = CarSums.of(owner, len(self.next_views.exists))
+
+        def total(values: Tensor) -> Tensor:
+            return sums.sum((in_both * values).sum(dim=1))
+
+        def centred(grey: Tensor) -> tuple[Tensor, Tensor]:
+            difference = grey - (total(grey) / count.clamp_min(1))[owner, None]
+            return difference, total(difference * difference).sqrt()
+
+        count = total(in_both)
+        here, contrast_here = centred(image.grey)
+        alike = torch.full_like(count, -1.0)
+        for dv, du in product(range(-_MOST_SHIFT_PX, _MOST_SHIFT_PX + 1), repeat=2):
+            there, contrast_there = centred(image.at(at.u + du, at.v + dv).value)
+            alike = torch.fmax(alike, total(here * there) / (contrast_here * contrast_there))
+        return alike, count
 
     def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> NextView:
         index = torch.nonzero_static(keep, size=len(numbers))[:, 0]

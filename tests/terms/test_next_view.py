@@ -25,6 +25,7 @@ from directshape_torch.terms.term import Sight
 
 # Three views of two cars.
 NEXT = torch.tensor([2, 3, 4, 5, 4, 5])
+FOCAL_PX = 150.0
 CODE = torch.tensor([[0.9, -0.4, 0.5], [-0.8, 0.3, -0.4]], dtype=torch.float64)
 
 
@@ -110,6 +111,35 @@ def test_pixels_count_that_the_next_view_shows() -> None:
     assert 0.2 * before < count < 0.8 * before
     # What it cost less is not won: a mean over all pixels of the view.
     torch.testing.assert_close(hidden.block_weight[:1], term.block_weight[:1])
+
+
+def test_one_car_looks_alike_in_the_next_view_a_little_beside_itself_too() -> None:
+    problem, state = at_truth(*drive())
+    term, sight = begun(problem, state)
+    alike, count = term.likeness(sight)
+    assert (alike[:4] > 0.97).all()
+    assert (alike[4:] == -1).all()
+    assert count.tolist() == [float((term.row_weight[term.blocks.owner == car] > 0).sum()) for car in range(6)]
+    depth = se3.inverse(state.T_obj_cam)[NEXT, 2, 3]
+    for shift_px, least, most in ((2.5, 0.9, 1.0), (9.0, -1.0, 0.8)):
+        aside = torch.zeros(6, 6, dtype=torch.float64)
+        aside[:, 0] = shift_px * depth / FOCAL_PX
+        beside, _ = term.likeness(problem.look(state._replace(T_obj_next=state.T_obj_next @ se3.exp(aside)[:, None])))
+        assert (beside[:4] > least).all()
+        assert (beside[:4] < most).all()
+
+
+def test_another_car_does_not_look_alike() -> None:
+    frames, detections = drive()
+    grey = frames.images_left.clone()
+    # In the second frame the car at the left is painted as nobody was.
+    painted = detections.mask_left[2] > 0
+    grey[1, :, painted] = 1 - grey[1, :, painted]
+    for images, least, most in ((frames.images_left, 0.97, 1.0), (grey, -1.0, 0.5)):
+        problem, state = at_truth(replace(frames, images_left=images), detections)
+        term, sight = begun(problem, state)
+        alike, _ = term.likeness(sight)
+        assert least < alike[0] < most
 
 
 def test_a_side_that_has_turned_away_does_not_count() -> None:

@@ -1,0 +1,127 @@
+"""Whether the views of a track are of one car: what each says of its shape, and whether it looks like the next.
+
+Ids of trackers pass from one car to another: a track is cut in time where one shape for both sides and a next view
+that looks different are too much. Derivation: docs/derivations/tracks.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from directshape_torch.refinement.problem import CarProblem
+from directshape_torch.solver.damped_solve import damped_step
+from directshape_torch.solver.gauss_newton import Minimum
+from directshape_torch.solver.sharing import said_of_shared
+from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.terms.next_view import NextView
+from directshape_torch.terms.photometric_rows import LeftPixels
+from directshape_torch.terms.term import Sight
+
+# Two sides of a cut are of one car unless this is exceeded by twice the cost that two shapes save, and so much for a
+# view that is not at all like the next. Of 445 cuts through rendered and real tracks of one car two exceed it, those of
+# a car in whose windows the sky appears; the others reach 8.7.
+_MOST_EVIDENCE, _UNLIKE = 9.0, 30.0
+# Reflections change as a car turns: so much less like is a view of it per degree, and at most.
+_LESS_LIKE_PER_DEG, _LESS_LIKE_BY_TURNING = 0.02, 0.25
+# Fewer pixels say nothing. Where those in both views are less than this share of what the smaller one shows, the car
+# must have turned from one to the next, which counts like so much less likeness; of one car it is 0.34 at least.
+_FEWEST_PIXELS, _LEAST_SHARE, _LESS_LIKE_WITHOUT_SHARE = 20, 0.1, 0.2
+# A mask that comes so near to the border of its image is cut off.
+_BORDER_PX = 2
+
+
+@dataclass(frozen=True)
+class SaidOfShape:
+    """What each of B views says of its code about where it ended, its pose following: `c^T A c / 2 - b^T c`."""
+
+    A: Tensor  # (B, K, K)
+    b: Tensor  # (B, K, 1)
+    anything: Tensor  # (B,) bool: there is such a quadratic
+
+    @classmethod
+    def at(cls, problem: CarProblem, minimum: Minimum[CarState]) -> SaidOfShape:
+        """Of B cars where each ended by itself."""
+        hessian = minimum.after.hessian.sum(dim=1)
+        nothing = torch.zeros_like(hessian[:, 0])
+        _, solvable = damped_step(hessian, nothing, nothing[:, 0])
+        # All slopes of a minimum add up to nothing.
+        A, _, has_any = said_of_shared(hessian, nothing, *own_and_shared(problem, hessian.device))
+        return cls(A, A @ minimum.end.code.to(A)[:, :, None], solvable & has_any)
+
+    def saved(self, views: list[int]) -> Tensor:
+        """Twice the cost (V - 1,) that is saved if before and after each cut in time have a shape of their own."""
+        index = torch.tensor(views, device=self.A.device)
+        A, b = (x.index_select(0, index).cumsum(dim=0) for x in (self.A, self.b))
+
+        def twice_least(A: Tensor, b: Tensor) -> Tensor:
+            solution: Tensor = torch.linalg.solve_ex(A, b)[0]
+            return -(b * solution).sum(dim=(1, 2))
+
+        together = twice_least(A[-1:], b[-1:])
+        return together - twice_least(A[:-1], b[:-1]) - twice_least(A[-1] - A[:-1], b[-1] - b[:-1])
+
+
+def own_and_shared(problem: CarProblem, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Numbers of a view's own unknowns, and of those of the shape."""
+    number = torch.arange(6 + problem.prior.num_codes + problem.num_offsets, device=device)
+    of_shape = (number >= 6) & (number < 6 + problem.prior.num_codes)
+    return number[~of_shape], number[of_shape]
+
+
+def unlikeness(term: NextView, seen_end: Sight, cars: CarBatch, next_view: Tensor) -> Tensor:
+    """How much less like the next (B,) each of B views of tracks is than a turning car explains; 0 if nobody knows."""
+    alike, count = term.likeness(seen_end)
+    towards = torch.nn.functional.normalize(seen_end.state.T_obj_cam[:, :3, 3], dim=1)
+    turned_deg = (towards * towards[next_view]).sum(dim=1).clamp(-1, 1).arccos().rad2deg()
+    explained = (_LESS_LIKE_PER_DEG * turned_deg).clamp_max(_LESS_LIKE_BY_TURNING)
+    unlike = torch.where(count >= _FEWEST_PIXELS, (1 - alike - explained).clamp_min(0), 0.0)
+    support = term.stereo.pixel_set.support
+    support = torch.minimum(support, support[next_view])
+    nothing_shared = (support >= _FEWEST_PIXELS) & (count < _LEAST_SHARE * support)
+    unlike = torch.where(nothing_shared, _LESS_LIKE_WITHOUT_SHARE, unlike)
+    # A car that the image cuts off may be placed wrongly along the cut.
+    assert term.stereo.left is not None
+    whole = ~_is_cut_off(term.stereo.left, cars)
+    return torch.where(term.next_views.exists & whole & whole[next_view], unlike, 0.0)
+
+
+def _is_cut_off(left: LeftPixels, cars: CarBatch) -> Tensor:
+    """Whether (B,) the left image ends within the mask of each car, at the left or right or below."""
+    height, width = left.pyramid[0].sizes[cars.frame_index].unbind(1)
+    row, steps = cars.detection_row[:, None], torch.arange(_BORDER_PX, device=height.device)
+    at_left, at_right = (left.mask_left[row, :, x] for x in (steps.expand(len(row), -1), width[:, None] - 1 - steps))
+    below = left.mask_left[row, height[:, None] - 1 - steps]
+    return torch.cat([x.flatten(1) for x in (at_left, at_right, below)], dim=1).amax(dim=1) > 0.5
+
+
+def parts_of_tracks(cars: CarBatch, says: SaidOfShape, joins: Tensor, unlike: Tensor) -> list[list[list[int]]]:
+    """The parts of each track of B cars: rows of the views of one car, in the order of times, or of frames.
+
+    Args:
+        cars: with their tracks.
+        says: what each says of its shape.
+        joins: (B,) bool, which may share a shape.
+        unlike: (B,) see `unlikeness`, as far as it is known.
+    """
+    assert cars.track_id is not None
+    views: dict[int, list[int]] = {}
+    order = (cars.frame_index if cars.time_s is None else cars.time_s).argsort(stable=True).tolist()
+    track_id, joining = cars.track_id.tolist(), joins.tolist()
+    for row in order:
+        if track_id[row] >= 0 and joining[row]:
+            views.setdefault(track_id[row], []).append(row)
+    return [_of_one_car(of_track, says, unlike) for of_track in views.values()]
+
+
+def _of_one_car(views: list[int], says: SaidOfShape, unlike: Tensor) -> list[list[int]]:
+    """The views (rows of a track), cut in time where there is most evidence of two cars, if that is too much."""
+    if len(views) < 2:
+        return [views]
+    evidence: list[float] = (says.saved(views) + _UNLIKE * unlike[views[:-1]]).tolist()
+    cut = max(range(len(evidence)), key=evidence.__getitem__)
+    if not evidence[cut] > _MOST_EVIDENCE:
+        return [views]
+    return _of_one_car(views[: cut + 1], says, unlike) + _of_one_car(views[cut + 1 :], says, unlike)

@@ -1,0 +1,94 @@
+"""What makes the views of a track be those of two cars: their shapes, and their looks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from helpers.ellipsoids import ellipsoid_prior
+from helpers.problems import DEFAULT
+from helpers.synthetic_scene import CAMERA_HEIGHT_M, joined_detections, joined_frames, street
+from torch import Tensor
+
+from directshape_torch.refinement.one_car import SaidOfShape, parts_of_tracks, unlikeness
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.terms.next_view import NextView, NextViews
+from directshape_torch.terms.photometric import Photometric
+
+NEXT = torch.tensor([1, 1])
+
+
+def says_of(codes: list[float], sigma: float = 1.0) -> SaidOfShape:
+    A = torch.full((len(codes), 1, 1), sigma**-2, dtype=torch.float64)
+    b = A * torch.tensor(codes, dtype=torch.float64)[:, None, None]
+    return SaidOfShape(A, b, torch.ones(len(codes), dtype=torch.bool))
+
+
+def track(num_views: int) -> Any:
+    frames = torch.arange(num_views)
+    return SimpleNamespace(track_id=torch.zeros(num_views, dtype=torch.long), frame_index=frames, time_s=None)
+
+
+def parts(codes: list[float], unlike: list[float]) -> list[list[int]]:
+    everybody = torch.ones(len(codes), dtype=torch.bool)
+    (of_track,) = parts_of_tracks(
+        track(len(codes)), says_of(codes), everybody, torch.tensor(unlike, dtype=torch.float64)
+    )
+    return of_track
+
+
+def test_shapes_and_looks_add_up() -> None:
+    codes = [0.0, 0.0, 2.0, 2.0]
+    torch.testing.assert_close(says_of(codes).saved([0, 1, 2, 3]), torch.tensor([4 / 3, 4.0, 4 / 3]).double())
+    together, halves = [[0, 1, 2, 3]], [[0, 1], [2, 3]]
+    assert parts(codes, [0.0] * 4) == together
+    assert parts(codes, [0.0, 0.15, 0.0, 0.0]) == together
+    assert parts(codes, [0.0, 0.2, 0.0, 0.0]) == halves
+    assert parts([0.0] * 4, [0.0, 0.2, 0.0, 0.0]) == together
+    assert parts([0.0] * 4, [0.0, 0.4, 0.0, 0.0]) == halves
+    # What is said of the last view is said of nothing.
+    assert parts([0.0] * 4, [0.0, 0.0, 0.0, 1.0]) == together
+
+
+def test_both_sides_of_a_cut_may_be_cut_again() -> None:
+    assert parts([0.0] * 5, [0.5, 0.0, 0.6, 0.0, 0.0]) == [[0], [1, 2], [3, 4]]
+
+
+def unlike(change: str | None = None) -> Tensor:
+    """How unlike the next a car looks that turns by six degrees, with masks that are changed."""
+    seen = [street(ellipsoid_prior(), [(0.2, CAMERA_HEIGHT_M, 8.0)], [-1.2 + 0.1 * n]) for n in range(2)]
+    frames = joined_frames([view.frames for view in seen])
+    detections = joined_detections([view.detections for view in seen], (120, 160))
+    mask = detections.mask_left.clone()
+    if change in ("painted", "painted and cut off"):
+        frames.images_left[1, :, mask[1] > 0] = 1 - frames.images_left[1, :, mask[1] > 0]
+    if change == "painted and cut off":
+        mask[1, 60:64, -1] = 1.0
+    if change == "apart":
+        # Half of the car, and in the next view the other half.
+        u = int((mask[0].sum(dim=0) > 0).nonzero().double().mean())
+        mask[0, :, u:] = 0
+        mask[1, :, : u + 3] = 0
+    refiner = DirectShapeRefiner(ellipsoid_prior(), DEFAULT)
+    problem, state = refiner.problem(frames, replace(detections, mask_left=mask))
+    stereo = next(term for term in problem.terms if isinstance(term, Photometric))
+    term = NextView(1.0, stereo, NextViews.of(stereo.cars, NEXT))
+    state = state._replace(path=state.code.new_zeros(2, 9), T_obj_next=state.T_obj_cam[NEXT][:, None])
+    problem = replace(problem, terms=(term,), num_path=9, num_next=1)
+    sight = problem.look(state)
+    (begun,) = problem.begin(problem.stages()[-1], sight).terms
+    assert isinstance(begun, NextView)
+    return unlikeness(begun, sight, stereo.cars, NEXT)
+
+
+@pytest.mark.parametrize(
+    ("change", "least", "most"),
+    [(None, 0.0, 0.05), ("painted", 0.7, 2.0), ("apart", 0.2, 0.2), ("painted and cut off", 0.0, 0.0)],
+)
+def test_how_unlike_a_view_is_to_the_next(change: str | None, least: float, most: float) -> None:
+    first, last = unlike(change).tolist()
+    assert least <= first <= most
+    assert last == 0
