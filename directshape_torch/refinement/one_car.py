@@ -71,6 +71,7 @@ def own_and_shared(problem: CarProblem, device: torch.device) -> tuple[Tensor, T
     return number[~of_shape], number[of_shape]
 
 
+@torch.no_grad()
 def unlikeness(term: NextView, seen_end: Sight, cars: CarBatch, next_view: Tensor) -> Tensor:
     """How much less like the next (B,) each of B views of tracks is than a turning car explains; 0 if nobody knows."""
     alike, count = term.likeness(seen_end)

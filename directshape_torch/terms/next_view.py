@@ -25,6 +25,7 @@ from directshape_torch.shape.field import Field
 from directshape_torch.terms import robust
 from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.photometric import (
+    LEAST_CONTRAST,
     Photometric,
     Surface,
     depth_of,
@@ -208,16 +209,20 @@ class NextView(Term):
         def total(values: Tensor) -> Tensor:
             return sums.sum((in_both * values).sum(dim=1))
 
+        count = total(in_both)
+        # Noise is no likeness of even cars, and no difference either.
+        noise = count * LEAST_CONTRAST**2
+
         def centred(grey: Tensor) -> tuple[Tensor, Tensor]:
             difference = grey - (total(grey) / count.clamp_min(1))[owner, None]
-            return difference, total(difference * difference).sqrt()
+            return difference, total(difference * difference) + noise
 
-        count = total(in_both)
         here, contrast_here = centred(image.grey)
         alike = torch.full_like(count, -1.0)
         for dv, du in product(range(-_MOST_SHIFT_PX, _MOST_SHIFT_PX + 1), repeat=2):
             there, contrast_there = centred(image.at(at.u + du, at.v + dv).value)
-            alike = torch.fmax(alike, total(here * there) / (contrast_here * contrast_there))
+            correlation = (total(here * there) + noise) / (contrast_here * contrast_there).sqrt()
+            alike = torch.fmax(alike, correlation)
         return alike, count
 
     def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> NextView:
