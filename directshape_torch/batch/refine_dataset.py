@@ -109,7 +109,7 @@ class _Run:
         self._look_for_files()
         if has_tracks(self.dataset):
             done = sorted(set(self.dataset.frame_ids).difference(self.earlier.manifest.failed))
-            write_tracks(self.out_dir, (read_shapes(shapes_path(self.out_dir, frame_id)) for frame_id in done))
+            self._write_tracks(done)
         return self._end(resumed, None)
 
     def _groups(self, finished: Collection[str]) -> list[FrameGroup]:
@@ -152,6 +152,12 @@ class _Run:
         num_done = len(summary.frames) - len(summary.failed)
         self.log.add(RunEvent(time.time(), end=end, done=num_done, failed=summary.failed, reason=reason))
         return summary
+
+    def _write_tracks(self, frame_ids: Sequence[str]) -> None:
+        frames = (read_shapes(shapes_path(self.out_dir, frame_id)) for frame_id in frame_ids)
+        if split := write_tracks(self.out_dir, frames):
+            some = ", ".join(split[:5]) + (" .." if len(split) > 5 else "")
+            self.warnings.append(f"tracks are not of one car each, and were split (docs/tracks.md): {some}")
 
     def _look_for_files(self) -> None:
         """Every frame must have come to an end; one without files has failed."""

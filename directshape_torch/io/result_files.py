@@ -258,8 +258,12 @@ def read_track(path: Path | str) -> TrackArrays:
     return read_arrays(path, TrackArrays, TRACK_SCHEMA_VERSION)
 
 
-def write_tracks(out_dir: Path | str, frames: Iterable[ShapeArrays]) -> None:
-    """Write the file of every track that goes through some finished frames of a run, in their order."""
+def write_tracks(out_dir: Path | str, frames: Iterable[ShapeArrays]) -> list[str]:
+    """Write the file of every track that goes through some finished frames of a run, in their order.
+
+    Returns:
+        The tracks that were split.
+    """
     views: dict[str, list[tuple[ShapeArrays, int]]] = {}
     for shapes in frames:
         for car, track in enumerate(shapes.tracks):
@@ -267,6 +271,7 @@ def write_tracks(out_dir: Path | str, frames: Iterable[ShapeArrays]) -> None:
                 views.setdefault(track, []).append((shapes, car))
     for track, cars in views.items():
         write_arrays(track_path(out_dir, track), _track(track, cars), TRACK_SCHEMA_VERSION)
+    return [track for track, cars in views.items() if any(shapes.track_parts[car] > 0 for shapes, car in cars)]
 
 
 def _track(track: str, views: list[tuple[ShapeArrays, int]]) -> TrackArrays:

@@ -19,6 +19,7 @@ from directshape_torch.errors import ResumeError
 from directshape_torch.io.result_files import read_shapes, read_track, track_path
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.stereo_dataset import open_dataset
+from directshape_torch.refinement import one_car
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +51,16 @@ def test_views_of_a_track_share_a_shape_and_get_a_file(shared_kitti: Path, seque
     # Lines are those of the frame, not of the sequence's file.
     run = RunFolder(tmp_path)
     assert [len(run.read(frame_id).refined_cars) for frame_id in run.frame_ids] == [2] * len(FRAMES)
+
+
+def test_split_tracks_are_named(
+    shared_kitti: Path, sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert not refine(shared_kitti, sequence, tmp_path / "whole").warnings
+    monkeypatch.setattr(one_car, "_of_one_car", lambda views, *_: [views[:1], views[1:]])
+    (warning,) = refine(shared_kitti, sequence, tmp_path / "split").warnings
+    assert warning == "tracks are not of one car each, and were split (docs/tracks.md): 000000, 000002"
+    assert read_track(track_path(tmp_path / "split", "000000")).parts.tolist() == [-1, 1, 1]
 
 
 def test_an_interrupted_run_keeps_to_its_windows(shared_kitti: Path, sequence: Path, tmp_path: Path) -> None:
