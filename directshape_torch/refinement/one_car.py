@@ -1,7 +1,7 @@
 """Whether the views of a track are of one car: what each says of its shape, and whether it looks like the next.
 
-Ids of trackers pass from one car to another: a track is cut in time where one shape for both sides and a next view
-that looks different are too much. Derivation: docs/derivations/tracks.md.
+Ids of trackers pass from one car to another: a track is cut in time where what two shapes save and how unlike the next
+view looks are too much together. Derivation: docs/derivations/tracks.md.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.sharing import said_of_shared
 from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.next_view import NextView
-from directshape_torch.terms.photometric_rows import LeftPixels
+from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.term import Sight
 
-# Two sides of a cut are of one car unless this is exceeded by twice the cost that two shapes save, and so much for a
-# view that is not at all like the next. Of 445 cuts through rendered and real tracks of one car two exceed it, those of
-# a car in whose windows the sky appears; the others reach 8.7.
+# Evidence that the sides of a cut are of two cars is twice the cost that two shapes save, and so many times how unlike
+# the next view is; up to a limit they are of one car. Chosen on 445 cuts through rendered and real tracks of one car:
+# two exceed it, where the sky appears in the windows, the others reach 8.7.
 _MOST_EVIDENCE, _UNLIKE = 9.0, 30.0
 # Reflections change as a car turns: so much less like is a view of it per degree, and at most.
 _LESS_LIKE_PER_DEG, _LESS_LIKE_BY_TURNING = 0.02, 0.25
-# Fewer pixels say nothing. Where those in both views are less than this share of what the smaller one shows, the car
-# must have turned from one to the next, which counts like so much less likeness; of one car it is 0.34 at least.
-_FEWEST_PIXELS, _LEAST_SHARE, _LESS_LIKE_WITHOUT_SHARE = 20, 0.1, 0.2
+# Fewer pixels say nothing. Views that share less than this share of the pixels of the smaller one are of a car that has
+# turned far, or of two: that counts as so unlike, which by itself is not enough. Of those 445 pairs the least is 0.34.
+_FEWEST_PIXELS, _LEAST_SHARE, _UNLIKE_WITHOUT_SHARE = 20, 0.1, 0.2
 # A mask that comes so near to the border of its image is cut off.
 _BORDER_PX = 2
 
@@ -72,7 +72,7 @@ def own_and_shared(problem: CarProblem, device: torch.device) -> tuple[Tensor, T
 
 
 @torch.no_grad()
-def unlikeness(term: NextView, seen_end: Sight, cars: CarBatch, next_view: Tensor) -> Tensor:
+def unlikeness(term: NextView, seen_end: Sight, next_view: Tensor) -> Tensor:
     """How much less like the next (B,) each of B views of tracks is than a turning car explains; 0 if nobody knows."""
     alike, count = term.likeness(seen_end)
     towards = torch.nn.functional.normalize(seen_end.state.T_obj_cam[:, :3, 3], dim=1)
@@ -82,30 +82,30 @@ def unlikeness(term: NextView, seen_end: Sight, cars: CarBatch, next_view: Tenso
     support = term.stereo.pixel_set.support
     support = torch.minimum(support, support[next_view])
     nothing_shared = (support >= _FEWEST_PIXELS) & (count < _LEAST_SHARE * support)
-    unlike = torch.where(nothing_shared, _LESS_LIKE_WITHOUT_SHARE, unlike)
+    unlike = torch.where(nothing_shared, _UNLIKE_WITHOUT_SHARE, unlike)
     # A car that the image cuts off may be placed wrongly along the cut.
-    assert term.stereo.left is not None
-    whole = ~_is_cut_off(term.stereo.left, cars)
+    whole = ~_is_cut_off(term.stereo)
     return torch.where(term.next_views.exists & whole & whole[next_view], unlike, 0.0)
 
 
-def _is_cut_off(left: LeftPixels, cars: CarBatch) -> Tensor:
+def _is_cut_off(stereo: Photometric) -> Tensor:
     """Whether (B,) the left image ends within the mask of each car, at the left or right or below."""
+    left, cars = stereo.left, stereo.cars
+    assert left is not None
     height, width = left.pyramid[0].sizes[cars.frame_index].unbind(1)
     row, steps = cars.detection_row[:, None], torch.arange(_BORDER_PX, device=height.device)
     at_left, at_right = (left.mask_left[row, :, x] for x in (steps.expand(len(row), -1), width[:, None] - 1 - steps))
     below = left.mask_left[row, height[:, None] - 1 - steps]
-    return torch.cat([x.flatten(1) for x in (at_left, at_right, below)], dim=1).amax(dim=1) > 0.5
+    return (torch.cat([x.flatten(1) for x in (at_left, at_right, below)], dim=1) > 0.5).any(dim=1)
 
 
-def parts_of_tracks(cars: CarBatch, says: SaidOfShape, joins: Tensor, unlike: Tensor) -> list[list[list[int]]]:
+def parts_by_shape(cars: CarBatch, says: SaidOfShape, joins: Tensor) -> list[list[list[int]]]:
     """The parts of each track of B cars: rows of the views of one car, in the order of times, or of frames.
 
     Args:
         cars: with their tracks.
         says: what each says of its shape.
         joins: (B,) bool, which may share a shape.
-        unlike: (B,) see `unlikeness`, as far as it is known.
     """
     assert cars.track_id is not None
     views: dict[int, list[int]] = {}
@@ -114,15 +114,25 @@ def parts_of_tracks(cars: CarBatch, says: SaidOfShape, joins: Tensor, unlike: Te
     for row in order:
         if track_id[row] >= 0 and joining[row]:
             views.setdefault(track_id[row], []).append(row)
-    return [_of_one_car(of_track, says, unlike) for of_track in views.values()]
+    parts, cut = [[of_track] for of_track in views.values()], True
+    while cut:
+        finer = cut_once(parts, says, torch.zeros_like(says.A[:, 0, 0]))
+        parts, cut = finer, finer != parts
+    return parts
+
+
+def cut_once(parts: list[list[list[int]]], says: SaidOfShape, unlike: Tensor) -> list[list[list[int]]]:
+    """The parts, each cut in time where there is most evidence of two cars, if that is too much.
+
+    Once, for where two cars were made one the looks of its other views suffer too. `unlike` (B,) is `unlikeness`.
+    """
+    return [[piece for part in of_track for piece in _of_one_car(part, says, unlike)] for of_track in parts]
 
 
 def _of_one_car(views: list[int], says: SaidOfShape, unlike: Tensor) -> list[list[int]]:
-    """The views (rows of a track), cut in time where there is most evidence of two cars, if that is too much."""
     if len(views) < 2:
         return [views]
-    evidence: list[float] = (says.saved(views) + _UNLIKE * unlike[views[:-1]]).tolist()
+    before_cuts = torch.tensor(views[:-1], device=unlike.device)
+    evidence: list[float] = (says.saved(views) + _UNLIKE * unlike.index_select(0, before_cuts)).tolist()
     cut = max(range(len(evidence)), key=evidence.__getitem__)
-    if not evidence[cut] > _MOST_EVIDENCE:
-        return [views]
-    return _of_one_car(views[: cut + 1], says, unlike) + _of_one_car(views[cut + 1 :], says, unlike)
+    return [views[: cut + 1], views[cut + 1 :]] if evidence[cut] > _MOST_EVIDENCE else [views]

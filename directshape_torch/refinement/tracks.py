@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from directshape_torch.refinement.one_car import SaidOfShape, own_and_shared, parts_of_tracks, unlikeness
+from directshape_torch.refinement.one_car import SaidOfShape, cut_once, own_and_shared, parts_by_shape, unlikeness
 from directshape_torch.refinement.outcome import at_states, going_on, judged, outcome_of
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.result import RefinementResult
@@ -52,8 +52,9 @@ def refined(
     if cars.track_id is None:
         return at_states(found, _attached(problem, cars, origin, minimum))
     says = SaidOfShape.at(problem, minimum)
-    joins, unlike = is_refined(minimum.status) & says.anything, torch.zeros_like(minimum.after.cost)
-    parts = parts_of_tracks(cars, says, joins, unlike)
+    joins = is_refined(minimum.status) & says.anything
+    parts = parts_by_shape(cars, says, joins)
+    # Until no view leaves and no part is cut.
     while True:
         shared = together(problem, cars, minimum, parts)
         if shared is None:
@@ -63,12 +64,15 @@ def refined(
         before = shared.linked(take_rows(initial, rows))
         in_track, of_track = _judged(shared.problem, views, before, agreed, came.rows(rows))
         left = (in_track.status == Status.singular.code) | (in_track.status == Status.non_finite.code)
-        joins = joins.index_fill(0, rows[left], False)
-        unlike = unlike.index_put((rows,), torch.maximum(unlike[rows], shared.unlike_next(in_track)))
-        tried, parts = parts, parts_of_tracks(cars, says, joins, unlike)
+        if bool(left.any()):
+            # What the others know once they know without it: from the beginning.
+            joins = joins.index_fill(0, rows[left], False)
+            parts = parts_by_shape(cars, says, joins)
+            continue
+        unlike = torch.zeros_like(minimum.after.cost).index_copy(0, rows, shared.unlike_next(in_track))
+        tried, parts = parts, cut_once(parts, says, unlike)
         if parts == tried:
             break
-        # What the others know once they know without it: from the beginning.
     chosen = is_refined(in_track.status).nonzero()[:, 0]
     if not unroll:
         # What they were alone has no part in their gradients.
@@ -154,13 +158,11 @@ class Together:
         return with_path(self.problem.config.tracks, self.agreement, self.cars, state)
 
     def unlike_next(self, minimum: Minimum[CarState]) -> Tensor:
-        """How unlike (R,) the next view of their part those views are that are least like it, 0 for the others."""
+        """How unlike the next view of their part views (R,) are."""
         term = next((term for term in minimum.stage.terms if isinstance(term, NextView)), None)
         if term is None:
             return torch.zeros_like(minimum.after.cost)
-        unlike = unlikeness(term, minimum.seen_end, self.cars, self.next_view)
-        # Where two cars are made one, their other views suffer too.
-        return torch.where(unlike == self.agreement.largest(unlike, self.agreement.everybody), unlike, 0.0)
+        return unlikeness(term, minimum.seen_end, self.next_view)
 
     def part_of(self, status: Tensor) -> Tensor:
         """The part of its track (R,), -1 for a view that ends with a shape of its own: no other was refined."""

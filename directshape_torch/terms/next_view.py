@@ -25,7 +25,6 @@ from directshape_torch.shape.field import Field
 from directshape_torch.terms import robust
 from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.photometric import (
-    LEAST_CONTRAST,
     Photometric,
     Surface,
     depth_of,
@@ -40,8 +39,9 @@ from directshape_torch.terms.term import Linear, Sight, Term
 NEXT_VIEW_NAME = "next_view"
 # What is not so far in front of the next camera is not seen by it.
 _LEAST_DEPTH_M = 0.1
-# An edge that is three pixels off no longer lies on itself.
-_MOST_SHIFT_PX = 3
+# Where two views are compared by their looks: pixels of the level that one may lie beside the other, and what is added
+# to the deviation of grey levels, so that noise of 5 grey levels on an even car makes no difference.
+_MOST_SHIFT_PX, _CONTRAST_FLOOR = 3, 10.0
 
 
 class NextViews(NamedTuple):
@@ -210,8 +210,7 @@ class NextView(Term):
             return sums.sum((in_both * values).sum(dim=1))
 
         count = total(in_both)
-        # Noise is no likeness of even cars, and no difference either.
-        noise = count * LEAST_CONTRAST**2
+        noise = count * _CONTRAST_FLOOR**2
 
         def centred(grey: Tensor) -> tuple[Tensor, Tensor]:
             difference = grey - (total(grey) / count.clamp_min(1))[owner, None]

@@ -41,7 +41,7 @@ Brightness = Literal["none", "gain", "affine"]
 # Two exposures differ by a few percent; more is a wrong pose.
 _GAIN_BOUNDS = (0.8, 1.25)
 # Contrast in grey levels that a car has at least: noise on an even one says nothing of the gain.
-LEAST_CONTRAST = 5.0
+_LEAST_CONTRAST = 5.0
 # Of a ray and the normal of the surface that it meets: below it is grazing and lost.
 _LEAST_RAY_COSINE = 0.1
 # Of a disparity, that an offset must leave of it: beyond infinity nothing is seen.
@@ -297,6 +297,6 @@ def matched_brightness(
     count = total(torch.ones_like(left)).clamp_min(1)
     means = [x / count for x in (total_left, total_right)]
     centred = [x - of_blocks(mean) for x, mean in zip((left, right), means, strict=True)]
-    deviation_left, deviation_right = ((total(x * x) / count + LEAST_CONTRAST**2).sqrt() for x in centred)
+    deviation_left, deviation_right = ((total(x * x) / count + _LEAST_CONTRAST**2).sqrt() for x in centred)
     gain = (deviation_right / deviation_left).clamp(*_GAIN_BOUNDS)
     return left * of_blocks(gain) + of_blocks(means[1] - gain * means[0])

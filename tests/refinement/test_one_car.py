@@ -13,7 +13,7 @@ from helpers.problems import DEFAULT
 from helpers.synthetic_scene import CAMERA_HEIGHT_M, joined_detections, joined_frames, street
 from torch import Tensor
 
-from directshape_torch.refinement.one_car import SaidOfShape, parts_of_tracks, unlikeness
+from directshape_torch.refinement.one_car import SaidOfShape, cut_once, parts_by_shape, unlikeness
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.terms.next_view import NextView, NextViews
 from directshape_torch.terms.photometric import Photometric
@@ -33,10 +33,10 @@ def track(num_views: int) -> Any:
 
 
 def parts(codes: list[float], unlike: list[float]) -> list[list[int]]:
-    everybody = torch.ones(len(codes), dtype=torch.bool)
-    (of_track,) = parts_of_tracks(
-        track(len(codes)), says_of(codes), everybody, torch.tensor(unlike, dtype=torch.float64)
-    )
+    """Of one track, by shapes and then by looks."""
+    says = says_of(codes)
+    by_shape = parts_by_shape(track(len(codes)), says, torch.ones(len(codes), dtype=torch.bool))
+    (of_track,) = cut_once(by_shape, says, torch.tensor(unlike, dtype=torch.float64))
     return of_track
 
 
@@ -53,8 +53,14 @@ def test_shapes_and_looks_add_up() -> None:
     assert parts([0.0] * 4, [0.0, 0.0, 0.0, 1.0]) == together
 
 
-def test_both_sides_of_a_cut_may_be_cut_again() -> None:
-    assert parts([0.0] * 5, [0.5, 0.0, 0.6, 0.0, 0.0]) == [[0], [1, 2], [3, 4]]
+def test_the_largest_sum_is_cut_and_once() -> None:
+    # By looks alone it were behind the first view.
+    assert parts([0.0, 0.0, 2.0, 2.0], [0.25, 0.2, 0.0, 0.0]) == [[0, 1], [2, 3]]
+    assert parts([0.0] * 5, [0.5, 0.0, 0.6, 0.0, 0.0]) == [[0, 1, 2], [3, 4]]
+
+
+def test_shapes_alone_cut_as_often_as_they_must() -> None:
+    assert parts([0.0, 0.0, 4.0, 4.0, 9.0], [0.0] * 5) == [[0, 1], [2, 3], [4]]
 
 
 def unlike(change: str | None = None) -> Tensor:
@@ -63,10 +69,11 @@ def unlike(change: str | None = None) -> Tensor:
     frames = joined_frames([view.frames for view in seen])
     detections = joined_detections([view.detections for view in seen], (120, 160))
     mask = detections.mask_left.clone()
-    if change in ("painted", "painted and cut off"):
+    cuts = {"cut at the left": (60, 0), "cut at the right": (60, -1), "cut below": (-1, 80)}
+    if change == "painted" or change in cuts:
         frames.images_left[1, :, mask[1] > 0] = 1 - frames.images_left[1, :, mask[1] > 0]
-    if change == "painted and cut off":
-        mask[1, 60:64, -1] = 1.0
+    if change in cuts:
+        mask[1][cuts[change]] = 1.0
     if change == "apart":
         # Half of the car, and in the next view the other half.
         u = int((mask[0].sum(dim=0) > 0).nonzero().double().mean())
@@ -81,12 +88,19 @@ def unlike(change: str | None = None) -> Tensor:
     sight = problem.look(state)
     (begun,) = problem.begin(problem.stages()[-1], sight).terms
     assert isinstance(begun, NextView)
-    return unlikeness(begun, sight, stereo.cars, NEXT)
+    return unlikeness(begun, sight, NEXT)
 
 
 @pytest.mark.parametrize(
     ("change", "least", "most"),
-    [(None, 0.0, 0.05), ("painted", 0.7, 2.0), ("apart", 0.2, 0.2), ("painted and cut off", 0.0, 0.0)],
+    [
+        (None, 0.0, 0.05),
+        ("painted", 0.7, 2.0),
+        ("apart", 0.2, 0.2),
+        ("cut at the left", 0.0, 0.0),
+        ("cut at the right", 0.0, 0.0),
+        ("cut below", 0.0, 0.0),
+    ],
 )
 def test_how_unlike_a_view_is_to_the_next(change: str | None, least: float, most: float) -> None:
     first, last = unlike(change).tolist()
