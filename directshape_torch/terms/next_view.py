@@ -40,8 +40,8 @@ NEXT_VIEW_NAME = "next_view"
 # What is not so far in front of the next camera is not seen by it.
 _LEAST_DEPTH_M = 0.1
 # Where two views are compared by their looks: pixels of the level that one may lie beside the other, and what is added
-# to the deviation of grey levels, so that noise of 5 grey levels on an even car makes no difference.
-_MOST_SHIFT_PX, _CONTRAST_FLOOR = 3, 10.0
+# to the variance of grey levels, the square of this, so that weak noise on an even car makes no difference.
+_MOST_SHIFT_PX, _CONTRAST_FLOOR = 3, 5.0
 
 
 class NextViews(NamedTuple):
