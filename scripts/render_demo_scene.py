@@ -10,7 +10,7 @@ as the seed has it), in the layout of KITTI's tracking benchmark, with tracks, t
 
 The same seed gives the same scene; the pixels are the same on the same renderer version and variant. A frame takes
 minutes (6 with `--cars 4 --paths-per-pixel 1` on two busy cores). Needs Mitsuba 3 and pyoidn.
-`--variant scalar_rgb` runs as installed; `llvm_ad_rgb`, ten times as fast, needs an LLVM library of
+`--variant scalar_rgb` runs as installed; `llvm_ad_rgb` (40 s with `--paths-per-pixel 4`) needs an LLVM library of
 version 19 (Debian: `apt-get update && apt-get install libllvm19`), older ones crash.
 """
 

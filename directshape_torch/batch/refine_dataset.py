@@ -156,8 +156,7 @@ class _Run:
     def _write_tracks(self, frame_ids: Sequence[str]) -> None:
         frames = (read_shapes(shapes_path(self.out_dir, frame_id)) for frame_id in frame_ids)
         if split := write_tracks(self.out_dir, frames):
-            some = ", ".join(split[:5]) + (" .." if len(split) > 5 else "")
-            self.warnings.append(f"tracks are not of one car each, and were split (docs/tracks.md): {some}")
+            self.warnings.append(f"tracks seem to be of two cars, and were split (docs/tracks.md): {_some(split)}")
 
     def _look_for_files(self) -> None:
         """Every frame must have come to an end; one without files has failed."""
@@ -172,8 +171,8 @@ class _Run:
         frames = {frame_id: self.frames[frame_id] for frame_id in self.dataset.frame_ids if frame_id in self.frames}
         warnings = [*find_warnings(frames, sorted(self.dataset.classes)), *self.warnings]
         if remade := self.earlier.remade:
-            some = ", ".join(remade[:5]) + (" .." if len(remade) > 5 else "")
-            warnings.append(f"files of {len(remade)} finished frames were damaged or gone and made again: {some}")
+            found = f"files of {len(remade)} finished frames were damaged or gone and made again"
+            warnings.append(f"{found}: {_some(remade)}")
         if self.num_halved:
             warnings.append(
                 f"{self.num_halved} calls did not work with all of their frames and were halved: the last digits of "
@@ -192,6 +191,10 @@ class _Run:
             "batch_frames": options.batch_frames,
             "outputs": list(options.outputs),
         }
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + (" .." if len(names) > 5 else "")
 
 
 def expected_cars(dataset: StereoDataset, frame_ids: Sequence[str]) -> int:
