@@ -9,8 +9,9 @@ import signal
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Self
@@ -24,8 +25,8 @@ from directshape_torch.io.run_manifest import FrameEntry
 # So many deaths before anything was ever finished are not the fault of single frames.
 _HOPELESS_DEATHS = 6
 _DEATH = "killed, out of memory or crashed"
-# The other end is gone, or went in the middle of something.
-_PIPE_ENDED = (EOFError, ConnectionError)
+# The other end is gone, or went in the middle of something: of a message cut short, a plain OSError.
+_PIPE_ENDED = (EOFError, OSError)
 
 
 def reports_of(
@@ -70,21 +71,23 @@ def reports_of(
 
 @dataclass
 class _Worker:
-    """A process; the job goes through its pipe with the first group."""
+    """A process, the pipe to it and what it is doing; the job goes through the pipe with the first group."""
 
     process: SpawnProcess
     pipe: Connection
     has_job: bool = False
+    group: FrameGroup | None = None
 
 
 class LocalWorkers:
-    """A process for each worker, so that a death has one culprit and disturbs nobody else.
+    """Processes, started with the first group, so that a death has one culprit and disturbs nobody else.
 
     Each has a pipe whose other end this process alone holds: however early a worker dies, the pipe ends. The standard
     pools hold both ends, and wait for ever for a worker that died before it had read all of a large job.
 
     Processes are spawned and not forked: threads of PyTorch do not survive a fork. They end with their parent, however
-    that ends. When the body ends, they finish the groups at hand.
+    that ends. When the body ends, they finish the groups at hand. It may be interrupted anywhere: each worker is among
+    the others from before its process starts until it has ended, or nobody would close its pipe.
     """
 
     def __init__(self, job: RunJob, num_workers: int, threads: int | None) -> None:
@@ -93,18 +96,16 @@ class LocalWorkers:
             self._job, self._threads = pickle.dumps(job), threads
         except (pickle.PicklingError, TypeError, AttributeError) as error:
             raise DirectShapeError(f"the job cannot be sent to other processes: {error}") from error
-        self._idle = [self._new_worker() for _ in range(num_workers)]
-        self._busy: dict[Connection, tuple[FrameGroup, _Worker]] = {}
-
-    @property
-    def capacity(self) -> int:
-        """One group for each process."""
-        return len(self._idle) + len(self._busy)
+        self.capacity = num_workers  # one group for each
+        self._workers: list[_Worker] = []
 
     def hand_out(self, group: FrameGroup) -> None:
         """Give a group to an idle process."""
-        worker = self._idle.pop()
-        self._busy[worker.pipe] = group, worker
+        # All of them start before the first waits for one to read a large job.
+        while len(self._workers) < self.capacity:
+            self._start_worker()
+        worker = next(each for each in self._workers if each.group is None)
+        worker.group = group
         # One that is dead says so by its pipe, to whoever waits for the report.
         with suppress(*_PIPE_ENDED):
             if not worker.has_job:
@@ -118,56 +119,90 @@ class LocalWorkers:
         Raises:
             DirectShapeError: a worker cannot read the job.
         """
-        return [self._report(pipe) for pipe in wait(self._busy) if isinstance(pipe, Connection)]
+        groups = {worker.pipe: (worker, worker.group) for worker in self._workers if worker.group is not None}
+        ready = [groups[pipe] for pipe in wait(groups) if isinstance(pipe, Connection)]
+        return [(group, self._report(worker)) for worker, group in ready]
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        workers = [*self._idle, *(worker for _, worker in self._busy.values())]
-        for worker in workers:
+        for worker in self._workers:
             worker.pipe.close()
-        for worker in workers:
-            worker.process.join()
+        for worker in self._workers:
+            if worker.process.pid is not None:
+                worker.process.join()
 
-    def _report(self, pipe: Connection) -> tuple[FrameGroup, GroupReport | None]:
-        group, worker = self._busy.pop(pipe)
+    def _report(self, worker: _Worker) -> GroupReport | None:
         report: GroupReport | str | None = None
         try:
-            report = pipe.recv()
+            report = worker.pipe.recv()
+            worker.group = None
         except _PIPE_ENDED:
-            pipe.close()
+            worker.pipe.close()
             worker.process.join()
-            worker = self._new_worker()
-        self._idle.append(worker)
+            self._workers.remove(worker)
         if isinstance(report, str):
             raise DirectShapeError(f"a worker cannot read the job: {report}")
-        return group, report
+        return report
 
-    def _new_worker(self) -> _Worker:
+    def _start_worker(self) -> None:
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
-        process = context.Process(target=_work, args=(theirs, self._threads))
-        process.start()
+        worker = _Worker(context.Process(target=_work, args=(theirs, self._threads)), ours)
+        self._workers.append(worker)
+        with _deaf_to_interrupts():
+            worker.process.start()
         theirs.close()
-        return _Worker(process, ours)
+
+
+@contextmanager
+def _deaf_to_interrupts() -> Iterator[None]:
+    """Processes that start in the body never hear Ctrl-C, which reaches all of them; the parent decides what it means.
+
+    From their first moment: until they could ignore it themselves, they import for seconds.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # only Unix has it
+        yield
+        return
+    resource_tracker.ensure_running()  # with the first process, it would let interrupts through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _work(pipe: Connection, threads: int | None) -> None:
     """The life of a worker: the job, then groups until the pipe ends."""
-    # Ctrl-C reaches the whole group of processes; the parent decides what it means.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # for systems where it could not be blocked
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    with suppress(*_PIPE_ENDED), limited_threads(threads):
-        content = pipe.recv_bytes()
-        try:
-            job: RunJob | str = pickle.loads(content)
-        # Whatever the code of a user's own classes raises in another process.
-        except Exception as error:
-            job = f"{type(error).__name__}: {error}"
+    job: RunJob | str | None = None
+    with limited_threads(threads):
+        for message in _messages(pipe):
+            if job is None:
+                job = _loaded(message)
+                continue
+            report = job if isinstance(job, str) else refine_group(job, pickle.loads(message))
+            with suppress(*_PIPE_ENDED):
+                pipe.send(report)
+
+
+def _messages(pipe: Connection) -> Iterator[bytes]:
+    """Until the pipe ends."""
+    with suppress(*_PIPE_ENDED):
         while True:
-            group = pipe.recv()
-            pipe.send(job if isinstance(job, str) else refine_group(job, group))
+            yield pipe.recv_bytes()
+
+
+def _loaded(content: bytes) -> RunJob | str:
+    """The job, or why it cannot be read."""
+    try:
+        job: RunJob = pickle.loads(content)
+    # Whatever the code of a user's own classes raises in another process.
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return job
 
 
 def _end_with_parent() -> None:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -49,14 +49,24 @@ def undisturbed(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def stopped_in_the_middle(root: Path, out: Path, by: signal.Signals) -> None:
-    """Stop a run with two workers when it has finished a frame or two, and wait until all of its processes are gone."""
+@contextmanager
+def slow_run(root: Path, out: Path) -> Iterator[subprocess.Popen[str]]:
+    """A run with two workers; no process of it is left after the body."""
     # The package that this test has, wherever it lies, and the helpers.
     folders = os.pathsep.join([str(TESTS), str(Path(directshape_torch.__file__).parent.parent)])
     environment = {**os.environ, "PYTHONPATH": folders, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(TESTS / "helpers" / "slow_run.py"), str(root), str(out)]
-    run = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL, start_new_session=True)
-    try:
+    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True) as run:
+        try:
+            yield run
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(run.pid, signal.SIGKILL)
+
+
+def stopped_in_the_middle(root: Path, out: Path, by: signal.Signals) -> None:
+    """Stop a run with two workers when it has finished a frame or two, and wait until all of its processes are gone."""
+    with slow_run(root, out) as run:
         wait_until(lambda: run.poll() is not None or len(done_frames(out)) > 0)
         assert run.poll() is None, "the run ended before it was stopped"
         status = read_status(out)
@@ -69,9 +79,6 @@ def stopped_in_the_middle(root: Path, out: Path, by: signal.Signals) -> None:
             run.send_signal(by)
         run.wait(_PATIENCE_S)
         wait_until(lambda: not any(map(is_running, workers)))
-    finally:
-        with suppress(ProcessLookupError):
-            os.killpg(run.pid, signal.SIGKILL)
 
 
 def children(pid: int) -> list[int]:
@@ -132,6 +139,15 @@ def test_an_interrupted_run_ends_its_frames_and_goes_on(root: Path, tmp_path: Pa
     assert len(list((out / "data").glob("*.txt"))) == status.num_done < len(FRAMES)
     assert len(refine(root, out).resumed) == status.num_done
     assert result_files(out) == result_files(undisturbed)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks for processes in /proc")
+def test_workers_that_still_start_say_nothing_of_an_interrupt(root: Path, tmp_path: Path) -> None:
+    with slow_run(root, tmp_path / "out") as run:
+        wait_until(lambda: len(children(run.pid)) == 3)  # two workers, one that looks after what processes share
+        os.killpg(run.pid, signal.SIGINT)
+        _, said = run.communicate(timeout=_PATIENCE_S)
+    assert said.count("Traceback") == said.count("KeyboardInterrupt") == 1
 
 
 @pytest.fixture

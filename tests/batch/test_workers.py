@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import sys
 from collections.abc import Callable, Collection
 from functools import partial
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
@@ -144,6 +146,39 @@ def test_a_worker_without_the_memory_for_a_call_halves_it(root: Path, tmp_path: 
     assert sorted(call.frame_ids for call in summary.timings.calls) == [(frame_id,) for frame_id in FRAMES]
     refine(root, tmp_path / "one", QuickRefiner(root), batch_frames=1, threads=1)
     assert result_files(tmp_path / "hungry") == result_files(tmp_path / "one")
+
+
+def fails_once(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
+    """The first report that this process receives ends in an error."""
+    receive, errors = Connection.recv, [error]
+
+    def recv(pipe: Connection) -> object:
+        report = receive(pipe)
+        if errors:
+            raise errors.pop()
+        return report
+
+    monkeypatch.setattr(Connection, "recv", recv)
+
+
+def test_no_worker_is_left_by_an_interrupt_at_a_report(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fails_once(monkeypatch, KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        refine(root, tmp_path, QuickRefiner(root), batch_frames=1, workers=2)
+    assert multiprocessing.active_children() == []
+
+
+def test_a_worker_that_dies_within_its_report_is_replaced(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fails_once(monkeypatch, OSError("got end of file during message"))
+    summary = refine(root, tmp_path / "out", QuickRefiner(root), batch_frames=1, workers=1)
+    assert summary.exit_code == 0
+    assert multiprocessing.active_children() == []
+    refine(root, tmp_path / "one", QuickRefiner(root), batch_frames=1, threads=1)
+    assert result_files(tmp_path / "out") == result_files(tmp_path / "one")
 
 
 def test_what_cannot_be_sent_to_a_worker_says_so(root: Path, tmp_path: Path) -> None:
