@@ -172,8 +172,9 @@ def _from_corners(corners: Tensor, form: _Format, convention: str) -> tuple[Tens
         cure = "see the order of corners in directshape_torch.geometry.box_formats"
         raise InputError("boxes", f"corners in the order of {convention!r}", got, cure)
     length_height_width = 2 * half.norm(dim=2)
-    # The nearest rotation, as corners are rounded.
-    U, _, Vh = torch.linalg.svd((half / half.norm(dim=2, keepdim=True)).double().mT)
-    R = (U @ Vh).to(corners)
+    # The nearest rotation, as corners are rounded; none of numbers that are not finite, or of a point.
+    axes = (half / half.norm(dim=2, keepdim=True)).double().mT
+    U, _, Vh = torch.linalg.svd(axes.nan_to_num(0, 0, 0))
+    R = (U @ Vh + 0 * axes).to(corners)
     bottom = centre + half[:, 1]
     return se3.from_rotation_translation(R, bottom), length_height_width[:, [1, 2, 0]]

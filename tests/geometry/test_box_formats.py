@@ -100,6 +100,13 @@ def test_corners_in_another_order_are_refused() -> None:
             boxes_to_poses(tools_corners(written)[None], read, MOTION.get(written))
 
 
+def test_corners_of_no_box_make_no_pose_and_leave_the_others_alone() -> None:
+    box = tools_corners("kitti")
+    T_cam_obj, _ = boxes_to_poses(torch.stack([torch.full_like(box, torch.nan), box, 0 * box + 5.0]), "kitti")
+    assert T_cam_obj.isfinite().all(dim=2).all(dim=1).tolist() == [False, True, False]
+    torch.testing.assert_close(T_cam_obj[1:2], expected(), atol=1e-6, rtol=0)
+
+
 def test_lidar_boxes_need_the_motion_to_the_camera() -> None:
     boxes = torch.tensor([WRITTEN["nuscenes"]])
     with pytest.raises(InputError, match=r"T_cam_boxes: expected the rigid motion camera_from_lidar.* got None; KITTI"):
