@@ -59,26 +59,41 @@ def test_the_largest_sum_is_cut_and_once() -> None:
     assert parts([0.0] * 5, [0.5, 0.0, 0.6, 0.0, 0.0]) == [[0, 1, 2], [3, 4]]
 
 
+@pytest.mark.parametrize("ordered_by", ["frame_index", "time_s"])
+def test_rows_come_in_any_order(ordered_by: str) -> None:
+    cars, in_time = track(5), [1, 4, 3, 0, 2]
+    setattr(cars, ordered_by, torch.tensor(in_time).argsort())
+    (of_track,) = parts_by_shape(cars, says_of([4.0, 0.0, 9.0, 4.0, 0.0]), torch.ones(5, dtype=torch.bool))
+    assert of_track == [[1, 4], [3, 0], [2]]
+    # By looks too: of the first view in time, which is row 1.
+    unlike = torch.tensor([0.0, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    assert cut_once([[in_time]], says_of([0.0] * 5), unlike) == [[[1], [4, 3, 0, 2]]]
+
+
 def test_shapes_alone_cut_as_often_as_they_must() -> None:
     assert parts([0.0, 0.0, 4.0, 4.0, 9.0], [0.0] * 5) == [[0, 1], [2, 3], [4]]
 
 
 def unlike(change: str | None = None) -> Tensor:
     """How unlike the next a car looks that turns by six degrees, with masks that are changed."""
-    seen = [street(ellipsoid_prior(), [(0.2, CAMERA_HEIGHT_M, 8.0)], [-1.2 + 0.1 * n]) for n in range(2)]
+    # The first image is larger, so that the second ends within the padding.
+    seen = [
+        street(ellipsoid_prior(), [(0.2, CAMERA_HEIGHT_M, 8.0)], [-1.2 + 0.1 * n], size_wh=size)
+        for n, size in enumerate([(190, 140), (160, 120)])
+    ]
     frames = joined_frames([view.frames for view in seen])
-    detections = joined_detections([view.detections for view in seen], (120, 160))
+    detections = joined_detections([view.detections for view in seen], (140, 190))
     mask = detections.mask_left.clone()
-    cuts = {"cut at the left": (60, 0), "cut at the right": (60, -1), "cut below": (-1, 80)}
+    cuts = {"cut at the left": (60, 0), "cut at the right": (60, 159), "cut below": (119, 80)}
     if change == "painted" or change in cuts:
         frames.images_left[1, :, mask[1] > 0] = 1 - frames.images_left[1, :, mask[1] > 0]
     if change in cuts:
         mask[1][cuts[change]] = 1.0
     if change == "apart":
         # Half of the car, and in the next view the other half.
-        u = int((mask[0].sum(dim=0) > 0).nonzero().double().mean())
-        mask[0, :, u:] = 0
-        mask[1, :, : u + 3] = 0
+        middle, of_next = (int((each.sum(dim=0) > 0).nonzero().double().mean()) for each in mask)
+        mask[0, :, middle:] = 0
+        mask[1, :, : of_next + 3] = 0
     refiner = DirectShapeRefiner(ellipsoid_prior(), DEFAULT)
     problem, state = refiner.problem(frames, replace(detections, mask_left=mask))
     stereo = next(term for term in problem.terms if isinstance(term, Photometric))
