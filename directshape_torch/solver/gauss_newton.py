@@ -50,8 +50,7 @@ class Minimum(Generic[StateT]):
     cost_history: Tensor
     stage_starts: tuple[StateT, ...]  # states at which each stage began and fixed its sets
     stage: Any  # the last stage that has begun, of all problems
-    seen_initial: Any  # what the problem's `look` gave at the input states
-    seen_end: Any  # and where the iterations ended
+    seen_end: Any  # what the problem's `look` gave where the iterations ended
     before: Any  # the last stage's figures at the input states
     after: Any  # and where the iterations ended
     trajectory: tuple[Iteration[StateT], ...] = ()  # all iterations in order, if they were asked for
@@ -161,7 +160,6 @@ def minimise(
             cost_history=torch.cat(history, dim=1) if history else nothing,
             stage_starts=tuple(starts),
             stage=stage,
-            seen_initial=seen_initial,
             seen_end=seen,
             before=before,
             after=after,

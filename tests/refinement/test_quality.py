@@ -90,7 +90,6 @@ def test_a_car_with_its_input_back_costs_after_what_it_cost_before() -> None:
         cost_history=torch.zeros(2, 0).double(),
         stage_starts=(initial,),
         stage=stage,
-        seen_initial=seen_initial,
         seen_end=seen_end,
         before=stage.figures(seen_initial),
         after=stage.figures(seen_end),
