@@ -87,6 +87,13 @@ def test_standard_deviations_are_in_the_frame_of_the_points_and_no_mask_is_judge
     other = fit_shape(points @ quarter.T, turned, "mmdet3d_lidar", PRIOR).cars
     expected = quarter @ one.covariance_xyz_yaw[:, :3, :3] @ quarter.T
     torch.testing.assert_close(other.covariance_xyz_yaw[:, :3, :3], expected, atol=1e-9, rtol=1e-4)
+    # x forward, y left, z up as z, -x, -y of a camera, in which headings turn the other way.
+    camera = torch.tensor([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+    kitti = torch.cat([boxes[:, :3] @ camera.T, boxes[:, [5, 4, 3]], -boxes[:, 6:] - torch.pi / 2], dim=1)
+    in_camera = fit_shape(points @ camera.T, kitti, "kitti", PRIOR).cars
+    J = torch.block_diag(camera, -torch.ones(1, 1, dtype=torch.float64))
+    expected = J @ one.covariance_xyz_yaw @ J.T
+    torch.testing.assert_close(in_camera.covariance_xyz_yaw, expected, atol=1e-9, rtol=1e-4)
     assert one.quality.mask_iou_left.isnan().all()
     assert one.quality.evidence[:, EVIDENCE_NAMES.index("mask_misfit_left")].isnan().all()
 

@@ -104,6 +104,8 @@ def fit_shape(
     kept = torch.where(fitted.refined[:, None, None], T_points_cam @ fitted.T_cam_obj, T_points_obj)
     J_points_cam = torch.eye(4).to(fitted.covariance_xyz_yaw).repeat(len(kept), 1, 1)
     J_points_cam[:, :3, :3] = T_points_cam[:, :3, :3]
+    # Headings turn about the camera's y axis, which points down, or about the z axis of the points, which points up.
+    J_points_cam[:, 3, 3] = (T_points_cam[:, 1, 1] + T_points_cam[:, 2, 1]).sign()
     covariance = J_points_cam @ fitted.covariance_xyz_yaw @ J_points_cam.mT
     # The masks are invented.
     iou, evidence = fitted.quality.mask_iou_left, fitted.quality.evidence.clone()
