@@ -25,8 +25,8 @@ from directshape_torch.io.run_manifest import FrameEntry
 # So many deaths before anything was ever finished are not the fault of single frames.
 _HOPELESS_DEATHS = 6
 _DEATH = "killed, out of memory or crashed"
-# The other end is gone, or went in the middle of something: of a message cut short, a plain OSError.
-_PIPE_ENDED = (EOFError, OSError)
+# Of a message that is cut short a plain OSError is raised.
+_NOTHING_COMES = (EOFError, OSError)
 
 
 def reports_of(
@@ -107,7 +107,7 @@ class LocalWorkers:
         worker = next(each for each in self._workers if each.group is None)
         worker.group = group
         # One that is dead says so by its pipe, to whoever waits for the report.
-        with suppress(*_PIPE_ENDED):
+        with suppress(ConnectionError):
             if not worker.has_job:
                 worker.pipe.send_bytes(self._job)
                 worker.has_job = True
@@ -138,7 +138,7 @@ class LocalWorkers:
         try:
             report = worker.pipe.recv()
             worker.group = None
-        except _PIPE_ENDED:
+        except _NOTHING_COMES:
             worker.pipe.close()
             worker.process.join()
             self._workers.remove(worker)
@@ -184,13 +184,15 @@ def _work(pipe: Connection, threads: int | None) -> None:
                 job = _loaded(message)
                 continue
             report = job if isinstance(job, str) else refine_group(job, pickle.loads(message))
-            with suppress(*_PIPE_ENDED):
+            try:
                 pipe.send(report)
+            except ConnectionError:
+                return
 
 
 def _messages(pipe: Connection) -> Iterator[bytes]:
     """Until the pipe ends."""
-    with suppress(*_PIPE_ENDED):
+    with suppress(*_NOTHING_COMES):
         while True:
             yield pipe.recv_bytes()
 
