@@ -127,6 +127,11 @@ def _format(convention: str) -> _Format:
     return _FORMATS[convention]
 
 
+def is_z_up(convention: BoxFormat) -> bool:
+    """Whether z is up in the frame of a format, and headings turn about it; else they turn about y, which is down."""
+    return _format(convention).upright
+
+
 def _to_camera(T_cam_boxes: Tensor | None, convention: str, like: Tensor) -> Tensor | None:
     if T_cam_boxes is None:
         if not _FORMATS[convention].upright:
@@ -172,9 +177,9 @@ def _from_corners(corners: Tensor, form: _Format, convention: str) -> tuple[Tens
         cure = "see the order of corners in directshape_torch.geometry.box_formats"
         raise InputError("boxes", f"corners in the order of {convention!r}", got, cure)
     length_height_width = 2 * half.norm(dim=2)
-    # The nearest rotation, as corners are rounded; none of numbers that are not finite, or of a point.
+    # The nearest rotation, as corners are rounded; none of numbers that are not finite, or where an edge has no length.
     axes = (half / half.norm(dim=2, keepdim=True)).double().mT
     U, _, Vh = torch.linalg.svd(axes.nan_to_num(0, 0, 0))
-    R = (U @ Vh + 0 * axes).to(corners)
+    R = (U @ Vh + 0 * axes.sum(dim=(1, 2), keepdim=True)).to(corners)
     bottom = centre + half[:, 1]
     return se3.from_rotation_translation(R, bottom), length_height_width[:, [1, 2, 0]]
