@@ -26,7 +26,7 @@ from directshape_torch.io.frame_detections import match_one_to_one
 from directshape_torch.io.kitti_labels import read_objects
 
 _CAR = 3  # COCO's
-# Cars without a mask: more than MOTS has instances, plus the number of the line.
+# More than MOTS has instances: for what has no mask, a number for each line of each frame.
 _UNKNOWN = 100_000
 
 
@@ -79,7 +79,7 @@ def _numbered(file: Path, frame: int, cars: dict[int, list[float]]) -> list[str]
     objects = read_objects(file)
     boxes = np.array([each.box_2d if each.type == "Car" else (0.0,) * 4 for each in objects]).reshape(-1, 4)
     found, _ = match_one_to_one(box_iou(boxes, np.array([*cars.values()]).reshape(-1, 4)))
-    numbers = [list(cars)[k] if k >= 0 else _UNKNOWN + row for row, k in enumerate(found.tolist())]
+    numbers = [list(cars)[k] if k >= 0 else _UNKNOWN * (frame + 1) + row for row, k in enumerate(found.tolist())]
     return [f"{frame} {number} {each.raw_line}\n" for number, each in zip(numbers, objects, strict=True)]
 
 

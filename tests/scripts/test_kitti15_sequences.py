@@ -43,8 +43,8 @@ def test_cars_are_numbered_over_the_frames_of_a_drive(tmp_path: Path) -> None:
     labels = read_tracking_objects(out / "label_02/0009.txt")
     assert [[each.track_id for each in labels[frame]] for frame in (0, 1)] == [
         [100_000, 1003, 1004],
-        [100_000, 1004, 100_002],
+        [200_000, 1004, 200_002],
     ]
     detections = read_tracking_objects(out / "detections/some/0009.txt")
-    assert [detections[frame][0].track_id for frame in (0, 1)] == [1004, 100_000]
+    assert [detections[frame][0].track_id for frame in (0, 1)] == [1004, 200_000]
     assert detections[0][0].score == 0.9
