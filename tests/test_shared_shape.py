@@ -34,6 +34,7 @@ from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.solver.gauss_newton import Minimum
+from directshape_torch.solver.problem import where_rows
 from directshape_torch.solver.sharing import Groups
 from directshape_torch.status import Status
 from directshape_torch.terms.cars import CarState
@@ -193,7 +194,7 @@ def test_a_view_without_a_mask_touches_nothing_else() -> None:
     torch.testing.assert_close(broken.T_cam_obj[rows], whole.T_cam_obj, rtol=0, atol=1e-9)
 
 
-def test_a_view_that_is_not_trusted_by_itself_does_not_join() -> None:
+def test_a_view_that_the_images_do_not_confirm_does_not_join() -> None:
     _, detections, _ = drive()
     far = detections.T_cam_obj.clone()
     far[2, :3, 3] *= 4.0
@@ -207,23 +208,68 @@ def test_a_view_that_is_not_trusted_by_itself_does_not_join() -> None:
     assert (result.code[4] == result.code[0]).all()
 
 
-def doubt_in_track(monkeypatch: pytest.MonkeyPatch, row: int) -> None:
-    """Have one view trusted by itself and not in its track."""
+def doubt(monkeypatch: pytest.MonkeyPatch, *in_track: int, alone: int | None = None, num_rows: int = 6) -> list[int]:
+    """Have views of a call or a track of so many rows not trusted, together or by itself; the sizes of all calls."""
+    sizes: list[int] = []
 
-    def judged(*args: Any) -> tuple[Minimum[CarState], RefinementResult]:
-        minimum, found = outcome.judged(*args)
-        if not isinstance(minimum.stage.problem.sharing, Groups):
+    def judged(minimum: Minimum[CarState], initial: CarState, *args: Any) -> tuple[Minimum[CarState], RefinementResult]:
+        minimum, found = outcome.judged(minimum, initial, *args)
+        sizes.append(len(minimum.status))
+        rows = in_track if isinstance(minimum.stage.problem.sharing, Groups) else (alone,)
+        if len(minimum.status) != num_rows:
             return minimum, found
-        status = minimum.status.index_fill(0, torch.tensor([row]), Status.not_trusted.code)
-        return replace(minimum, status=status), replace(found, status_code=status)
+        doubtful = torch.tensor([row in rows for row in range(num_rows)])
+        status = torch.where(doubtful, Status.not_trusted.code, minimum.status)
+        state = where_rows(doubtful, initial, minimum.state)
+        return replace(minimum, state=state, status=status), replace(found, status_code=status)
 
     monkeypatch.setattr(tracks, "judged", judged)
+    return sizes
+
+
+def test_a_view_that_is_not_trusted_alone_is_where_its_track_makes_it_trusted(monkeypatch: pytest.MonkeyPatch) -> None:
+    together = of_tracks(*[0, 1] * 3)
+    doubt(monkeypatch, alone=2)
+    assert refined(drive()[1]).status[2] == Status.not_trusted
+    assert_same(refined(drive()[1], [0, 1] * 3), together)
+
+
+@pytest.mark.parametrize("in_track", [(2,), (0, 4)])
+def test_a_view_that_is_not_trusted_in_good_company_leaves_the_track_as_without_it(
+    monkeypatch: pytest.MonkeyPatch, in_track: tuple[int, ...]
+) -> None:
+    """It is not trusted in its track, or alone is."""
+    _, detections, _ = drive()
+    without = of_tracks(0, 1, -1, 1, 0, 1)
+    sizes = doubt(monkeypatch, *in_track, alone=2)
+    result = refined(detections, [0, 1] * 3)
+    assert sizes == [6, 6, 5]
+    assert result.status[2] == Status.not_trusted
+    assert torch.equal(result.T_cam_obj[2], detections.T_cam_obj[2])
+    others = [0, 1, 3, 4, 5]
+    for name in ("T_cam_obj", "code", "covariance", "cost_after"):
+        assert torch.equal(getattr(result, name)[others], getattr(without, name)[others]), name
+
+
+def test_a_view_that_is_not_trusted_alone_splits_no_track(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(one_car, "_MOST_EVIDENCE", 3.0)
+    _, detections, _ = drive(contrast=2.5)
+    parts: list[list[list[list[int]]]] = []
+
+    def recorded(*args: Any) -> list[list[list[int]]]:
+        parts.append(one_car.parts_by_shape(*args))
+        return parts[-1]
+
+    monkeypatch.setattr(tracks, "parts_by_shape", recorded)
+    doubt(monkeypatch, alone=4)
+    refined(detections, [0, 1, 0, 1, 1, 0], contrast=2.5)
+    assert parts[0] == [[[0, 2], [5]], [[1, 3, 4]]]
 
 
 def test_a_view_that_is_not_trusted_in_its_track_keeps_what_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
     _, detections, _ = drive()
     alone, trusted = by_themselves(), of_tracks(*[0, 1] * 3)
-    doubt_in_track(monkeypatch, 2)
+    doubt(monkeypatch, 2)
     result = refined(detections, [0, 1] * 3)
     others = [0, 1, 3, 4, 5]
     for name, values in result.state_dict().items():
@@ -254,25 +300,28 @@ def test_a_view_whose_track_has_no_other_that_is_trusted_has_a_shape_of_its_own(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     _, detections, _ = drive()
-    doubt_in_track(monkeypatch, 1)
+    doubt(monkeypatch, 1, num_rows=4)
     assert refined(detections, [0, -1, 0, 1, -1, 1]).track_part.tolist() == [-1, -1, -1, 0, -1, 0]
 
 
 @pytest.mark.parametrize(
     ("mode", "time_s", "doubted"),
     [
-        ("unroll", None, False),
-        ("unroll", (0, 0.1), True),
-        ("implicit", None, True),
-        ("implicit", (0, 0.1), False),
-        ("implicit_gauss_newton", None, False),
+        ("unroll", None, ""),
+        ("unroll", None, "alone"),
+        ("unroll", (0, 0.1), "in_track"),
+        ("implicit", None, "in_track"),
+        ("implicit", (0, 0.1), "alone"),
+        ("implicit_gauss_newton", None, ""),
     ],
 )
 def test_gradients_of_a_track_are_those_of_differences(
-    mode: str, time_s: tuple[float, float] | None, doubted: bool, monkeypatch: pytest.MonkeyPatch
+    mode: str, time_s: tuple[float, float] | None, doubted: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if doubted:
-        doubt_in_track(monkeypatch, 1)
+    if doubted == "in_track":
+        doubt(monkeypatch, 1, num_rows=2)
+    elif doubted:
+        doubt(monkeypatch, alone=1, num_rows=2)
     prior, scene = cached_street()
     frames = joined_frames([scene.frames] * 2)
     if time_s is not None:
@@ -286,9 +335,12 @@ def test_gradients_of_a_track_are_those_of_differences(
     direction[1] = 0
 
     def summary_at(config: RefinerConfig, by: Tensor | float) -> Tensor:
+        if (mode, doubted) == ("unroll", "alone"):
+            # So few that it matters where the track begins.
+            config = replace(config, stages=tuple(replace(stage, max_iterations=2) for stage in config.stages))
         moved = replace(frames, images_right=frames.images_right + by * direction)
         result = DirectShapeRefiner(prior, config)(moved, track)
-        assert doubted != bool((result.code[0] == result.code[1]).all())
+        assert (doubted != "in_track") == bool((result.code[0] == result.code[1]).all())
         return summary(result)
 
     by = torch.zeros((), dtype=torch.float64, requires_grad=True)

@@ -151,7 +151,7 @@ def _of_a_track(problem: CarProblem, cars: CarBatch, state: CarState) -> CarProb
     T_world_cam = se3.exp(time_s[:, None] * time_s.new_tensor([0.5, 0.0, 10.0, 0.0, 0.2, 0.0]))
     sharing = Groups.of([0] * len(cars), *own_and_shared(problem, state.code.device))
     views = timed(sharing, replace(cars, time_s=time_s, T_world_cam=T_world_cam))
-    return in_tracks(problem, sharing, views, state, (number + 1).clamp_max(len(cars) - 1))
+    return in_tracks(problem, sharing, views, state, sharing.everybody, (number + 1).clamp_max(len(cars) - 1))
 
 
 def _named(stage: CarStage, other_forms: CarStage) -> dict[str, Term]:

@@ -15,6 +15,7 @@ from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.sharing import said_of_shared
+from directshape_torch.status import is_refined
 from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.next_view import NextView
 from directshape_torch.terms.photometric import Photometric
@@ -35,11 +36,15 @@ _BORDER_PX = 2
 
 @dataclass(frozen=True)
 class SaidOfShape:
-    """What each of B views says of its code about where it ended, its pose following: `c^T A c / 2 - b^T c`."""
+    """What each of B views says of its code about where it ended, its pose following: `c^T A c / 2 - b^T c`.
+
+    A view that is not trusted says nothing (A and b are 0): that it ended elsewhere is no sign of another car. Where a
+    track is cut beside it, it goes with the later views.
+    """
 
     A: Tensor  # (B, K, K)
     b: Tensor  # (B, K, 1)
-    anything: Tensor  # (B,) bool: there is such a quadratic
+    anything: Tensor  # (B,) bool: there is such a quadratic, so that it can share a shape, trusted or not
 
     @classmethod
     def at(cls, problem: CarProblem, minimum: Minimum[CarState]) -> SaidOfShape:
@@ -49,7 +54,8 @@ class SaidOfShape:
         _, solvable = damped_step(hessian, nothing, nothing[:, 0])
         # All slopes of a minimum add up to nothing.
         A, _, has_any = said_of_shared(hessian, nothing, *own_and_shared(problem, hessian.device))
-        return cls(A, A @ minimum.end.code.to(A)[:, :, None], solvable & has_any)
+        trusted = torch.where(is_refined(minimum.status)[:, None, None], A, 0.0)
+        return cls(trusted, trusted @ minimum.end.code.to(A)[:, :, None], solvable & has_any)
 
     def saved(self, views: list[int]) -> Tensor:
         """Twice the cost (V - 1,) that is saved if before and after each cut in time have a shape of their own."""
@@ -57,7 +63,8 @@ class SaidOfShape:
         A, b = (x.index_select(0, index).cumsum(dim=0) for x in (self.A, self.b))
 
         def twice_least(A: Tensor, b: Tensor) -> Tensor:
-            solution: Tensor = torch.linalg.solve_ex(A, b)[0]
+            # Views that say nothing have the least 0, wherever it is.
+            solution: Tensor = torch.linalg.solve_ex(A, b)[0].nan_to_num(0.0, 0.0, 0.0)
             return -(b * solution).sum(dim=(1, 2))
 
         together = twice_least(A[-1:], b[-1:])

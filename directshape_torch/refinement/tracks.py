@@ -1,8 +1,8 @@
 """Cars refined by themselves, then the views of each track together: one shape, and steps in common.
 
-So a view that is not trusted by itself never joins a track, one that is not trusted in it keeps what it was alone, and
-what each says of the shape is known before they are made to agree. Whether a track is of one car is known once its
-views are together: if it is not, they are brought together again in parts.
+So what each says of the shape is known before they are made to agree. A view that is not trusted in its track keeps
+what it was alone. One that fails in it, or was not trusted alone either, leaves, and the others are brought together
+again; so they are, in parts, where it shows that a track is not of one car.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.solver.differentiate import implicit_state, unrolled_state
 from directshape_torch.solver.gauss_newton import Minimum, minimise
-from directshape_torch.solver.problem import put_rows, take_rows
+from directshape_torch.solver.problem import put_rows, take_rows, where_rows
 from directshape_torch.solver.sharing import Groups
 from directshape_torch.status import Status, is_refined
 from directshape_torch.terms.cars import CarBatch, CarState, following, retract
@@ -52,7 +52,8 @@ def refined(
     if cars.track_id is None:
         return at_states(found, _attached(problem, cars, origin, minimum))
     says = SaidOfShape.at(problem, minimum)
-    joins = is_refined(minimum.status) & says.anything
+    doubtful = minimum.status == Status.not_trusted.code
+    joins = (is_refined(minimum.status) | doubtful) & says.anything
     parts = parts_by_shape(cars, says, joins)
     # Until no view leaves and no part is cut.
     while True:
@@ -60,12 +61,16 @@ def refined(
         if shared is None:
             return at_states(found, _attached(problem, cars, origin, minimum))
         views, rows = cars.of_cars(shared.keep), shared.keep.nonzero()[:, 0]
-        agreed = shared.agreed(take_rows(minimum.state, rows))
+        agreed = shared.agreed(take_rows(minimum.end, rows))
         before = shared.linked(take_rows(initial, rows))
         in_track, of_track = _judged(shared.problem, views, before, agreed, came.rows(rows))
         left = (in_track.status == Status.singular.code) | (in_track.status == Status.non_finite.code)
+        # Nor is a view trusted on the word of a track in which nobody else is.
+        unsure = ~is_refined(in_track.status) | (shared.part_of(in_track.status) < 0)
+        left = left | (doubtful[rows] & unsure)
         if bool(left.any()):
-            # What the others know once they know without it: from the beginning.
+            # What the others know once they know without it: from the beginning. Before any cut by looks, which differ
+            # from what they should be where a view is placed wrongly.
             joins = joins.index_fill(0, rows[left], False)
             parts = parts_by_shape(cars, says, joins)
             continue
@@ -74,12 +79,12 @@ def refined(
         if parts == tried:
             break
     chosen = is_refined(in_track.status).nonzero()[:, 0]
-    if not unroll:
-        # What they were alone has no part in their gradients.
-        status = minimum.status.index_fill(0, rows[chosen], Status.rejected_worse.code)
-        minimum = replace(minimum, status=status)
-    alone = _attached(problem, cars, origin, minimum)
-    of_views = _attached(shared.problem, views, shared.agreed(take_rows(alone, rows)), _of_all_members(in_track))
+    stays = is_refined(minimum.status).index_fill(0, rows[chosen], False)
+    # Where views began together has a part in gradients by repeated steps, in no others.
+    alone = _attached(problem, cars, origin, _at_ends(minimum, stays | shared.keep if unroll else stays))
+    # A track's steps depend on all of its views, trusted or not.
+    of_all = _at_ends(in_track, torch.ones_like(rows, dtype=torch.bool))
+    of_views = _attached(shared.problem, views, shared.agreed(take_rows(alone, rows)), of_all)
     own = found.rows(rows)
     of_track = replace(
         of_track,
@@ -104,9 +109,10 @@ def _judged(
         return judged(minimum, initial, found, problem.config.acceptance)
 
 
-def _of_all_members(in_track: Minimum[CarState]) -> Minimum[CarState]:
-    """With the ends of all members of a track, whom its steps depend on, trusted or not."""
-    return replace(in_track, state=in_track.end, status=torch.full_like(in_track.status, Status.converged.code))
+def _at_ends(minimum: Minimum[CarState], which: Tensor) -> Minimum[CarState]:
+    """For `_attached`: these cars (B,) where their iterations ended, trusted or not; the others as if not refined."""
+    status = torch.where(which, Status.converged.code, Status.rejected_worse.code)
+    return replace(minimum, state=where_rows(which, minimum.end, minimum.state), status=status)
 
 
 def _attached(problem: CarProblem, cars: CarBatch, start: CarState, minimum: Minimum[CarState]) -> CarState:
@@ -192,14 +198,21 @@ def together(
     part_number = torch.tensor(of_part, device=keep.device)
     next_view = torch.tensor([numbers.index(row) for row in after], device=keep.device)
     timed_views = timed(sharing, cars.of_cars(keep))
-    of_track = in_tracks(problem.of_problems(keep), sharing, timed_views, take_rows(minimum.end, index), next_view)
+    trusted = is_refined(minimum.status).index_select(0, index)
+    alone = take_rows(minimum.end, index)
+    of_track = in_tracks(problem.of_problems(keep), sharing, timed_views, alone, trusted, next_view)
     hessian = minimum.after.hessian.sum(dim=1)[index]
     return Together(keep, of_track, sharing, timed_views, hessian, part_number, next_view)
 
 
-def in_tracks(problem: CarProblem, sharing: Groups, views: CarBatch, alone: CarState, next_view: Tensor) -> CarProblem:
+def in_tracks(
+    problem: CarProblem, sharing: Groups, views: CarBatch, alone: CarState, trusted: Tensor, next_view: Tensor
+) -> CarProblem:
     """The last stage of a problem of R views: one shape in each group, a path where times are known, each view seen in
-    the next."""
+    the next.
+
+    `alone` is where they ended by themselves, `trusted` (R,) who is trusted there.
+    """
     everybody = sharing.everybody
     one = everybody.to(torch.float64)
     factors = one[:, None].expand(-1, len(problem.term_names)) if problem.factors is None else problem.factors
@@ -209,7 +222,11 @@ def in_tracks(problem: CarProblem, sharing: Groups, views: CarBatch, alone: CarS
     config = replace(problem.config, stages=(last,))
     terms: list[Term] = [*motion_terms(config.tracks, views)]
     # A track has one acceleration, whoever its views are.
-    columns = [hold_of_path(config.tracks, sharing, views, alone), 1 / sharing.total(one, everybody)] if terms else []
+    columns = (
+        [hold_of_path(config.tracks, sharing, views, alone, trusted), 1 / sharing.total(one, everybody)]
+        if terms
+        else []
+    )
     num_path = NUM_PATH if terms else 0
     stereo = next((term for term in problem.terms if isinstance(term, Photometric)), None)
     num_next = int(stereo is not None and config.tracks.next_view_weight > 0)

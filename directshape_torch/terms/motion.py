@@ -100,8 +100,13 @@ def acceleration_prior(state: CarState, sigma: tuple[float, float, float]) -> Pr
     return PriorResidual(state.path[:, 2::3] * per_sigma, J)
 
 
-def with_path(config: TracksConfig, sharing: Groups, cars: CarBatch, state: CarState) -> CarState:
-    """States (R) with the path of each group that fits its views best; as they are where there is no motion prior."""
+def with_path(
+    config: TracksConfig, sharing: Groups, cars: CarBatch, state: CarState, say: Tensor | None = None
+) -> CarState:
+    """States (R) with the path of each group that fits its views best; as they are where there is no motion prior.
+
+    `say` (R,) are weights of views, by default alike.
+    """
     if not follow_paths(config, cars):
         return state
     place, heading, _, _ = _on_the_ground(cars, state.T_obj_cam)
@@ -109,6 +114,7 @@ def with_path(config: TracksConfig, sharing: Groups, cars: CarBatch, state: CarS
     seen = torch.cat([place, _continuous(sharing, cars.time_s, heading)[:, None]], dim=1)
     everybody, basis = sharing.everybody, _basis(cars).to(torch.float64)
     weight = 1 / deviation_sigma(config, cars.time_s).to(basis).square()
+    weight = weight if say is None else weight * say[:, None]
     columns = []
     for column, sigma in enumerate(_of_acceleration(config)):
         weighted = weight[:, column, None] * basis
@@ -130,9 +136,13 @@ def _continuous(sharing: Groups, time_s: Tensor, heading: Tensor) -> Tensor:
     return heading.index_put((rows[filled],), unwound[filled])
 
 
-def hold_of_path(config: TracksConfig, sharing: Groups, cars: CarBatch, alone: CarState) -> Tensor:
-    """Factor (R,) of what deviations cost views that ended here by themselves: 1 where a path fits their track."""
-    fitted = with_path(config, sharing, cars, alone)
+def hold_of_path(config: TracksConfig, sharing: Groups, cars: CarBatch, alone: CarState, trusted: Tensor) -> Tensor:
+    """Factor (R,) of what deviations cost views that ended here by themselves: 1 where a path fits their track.
+
+    A view that is not trusted (R,) may be far from it: the path may bring it back.
+    """
+    trusted = trusted | ~sharing.any(trusted)
+    fitted = with_path(config, sharing, cars, alone, torch.where(trusted, 1.0, _NEXT_TO_NOTHING))
     assert cars.time_s is not None
     place, heading, _, _ = _on_the_ground(cars, fitted.T_obj_cam)
     on_path = (fitted.path.view(-1, 3, 3) * _basis(cars)[:, None]).sum(dim=2)
@@ -141,7 +151,7 @@ def hold_of_path(config: TracksConfig, sharing: Groups, cars: CarBatch, alone: C
     turned = torch.sin(heading - on_path[:, 2]).abs()
     too_far = off > _FURTHEST * torch.hypot(sigma[:, 0], own)
     too_far |= turned > _FURTHEST * torch.hypot(sigma[:, 2], torch.full_like(own, _OWN_HEADING))
-    return torch.ones_like(off, dtype=torch.float64).masked_fill(sharing.any(too_far), _NEXT_TO_NOTHING)
+    return torch.ones_like(off, dtype=torch.float64).masked_fill(sharing.any(too_far & trusted), _NEXT_TO_NOTHING)
 
 
 def timed(sharing: Groups, cars: CarBatch) -> CarBatch:

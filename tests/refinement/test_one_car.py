@@ -59,6 +59,17 @@ def test_the_largest_sum_is_cut_and_once() -> None:
     assert parts([0.0] * 5, [0.5, 0.0, 0.6, 0.0, 0.0]) == [[0, 1, 2], [3, 4]]
 
 
+@pytest.mark.parametrize("silent", [0, 2, 5])
+def test_views_that_say_nothing_of_the_shape_hide_no_cut(silent: int) -> None:
+    says = says_of([0.0, 0.0, 0.0, 4.0, 4.0, 4.0])
+    says.A[silent] = says.b[silent] = 0.0
+    before, after = parts_by_shape(track(6), says, torch.ones(6, dtype=torch.bool))[0]
+    assert {0, 1, 2}.difference({silent}) <= set(before)
+    assert {3, 4, 5}.difference({silent}) <= set(after)
+    nothing = replace(says, A=0 * says.A, b=0 * says.b)
+    assert parts_by_shape(track(6), nothing, torch.ones(6, dtype=torch.bool)) == [[[0, 1, 2, 3, 4, 5]]]
+
+
 @pytest.mark.parametrize("ordered_by", ["frame_index", "time_s"])
 def test_rows_come_in_any_order(ordered_by: str) -> None:
     cars, in_time = track(5), [1, 4, 3, 0, 2]

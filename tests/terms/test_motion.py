@@ -66,7 +66,7 @@ def test_a_car_may_turn_back() -> None:
     modulo = (path[:, 6] - turning[6] + math.pi / 2) % math.pi - math.pi / 2
     torch.testing.assert_close(modulo, torch.zeros(5, dtype=torch.float64))
     torch.testing.assert_close(path[:, 7], turning[7].expand(5))
-    assert hold_of_path(CONFIG, sharing, cars, state).tolist() == [1.0] * 5
+    assert hold_of_path(CONFIG, sharing, cars, state, sharing.everybody).tolist() == [1.0] * 5
     # With its acceleration the path itself is where the car is.
     place, _ = motion_terms(CONFIG, cars)
     assert place.residual_of(cars, state._replace(path=turning.expand(5, 9))).residual.abs().max() < 1e-9
@@ -213,4 +213,16 @@ def test_a_track_that_jumps_or_heads_elsewhere_is_held_by_next_to_nothing(
     T_cam_obj = se3.inverse(state.T_obj_cam)
     T_cam_obj[2:, 0, 3] += jump_m
     state = CarState.of(se3.inverse(T_cam_obj), random(5, 3))
-    assert hold_of_path(CONFIG, sharing, timed(sharing, cars), state).tolist() == [hold] * 5
+    assert hold_of_path(CONFIG, sharing, timed(sharing, cars), state, sharing.everybody).tolist() == [hold] * 5
+
+
+@pytest.mark.parametrize(("trusted", "hold"), [((0, 1, 2, 3, 4), 1e-4), ((0, 1, 3, 4), 1.0), ((), 1e-4)])
+def test_a_view_that_is_not_trusted_takes_the_path_from_nobody(trusted: tuple[int, ...], hold: float) -> None:
+    cars, _ = views(with_camera=False)
+    sharing = Groups.of([4] * 5, own=torch.arange(6), shared=torch.arange(6, 9))
+    path = torch.tensor([0.0, 0.0, 0.0, 20.0, 9.0, 0.0, 1.6, 0.0, 0.0], dtype=torch.float64)
+    T_cam_obj = se3.inverse(on_a_path(path, None).T_obj_cam)
+    T_cam_obj[2, 0, 3] += 8.0
+    state = CarState.of(se3.inverse(T_cam_obj), random(5, 3))
+    is_trusted = torch.zeros(5, dtype=torch.bool).index_fill(0, torch.tensor(trusted, dtype=torch.long), True)
+    assert hold_of_path(CONFIG, sharing, timed(sharing, cars), state, is_trusted).tolist() == [hold] * 5
