@@ -17,9 +17,8 @@ from directshape_torch.errors import InputError, NoGradientWarning, SceneWarning
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.gradient_mode import is_within_transform
-from directshape_torch.observation.extents import scene_extents
 from directshape_torch.observation.packing import Observation, pack_pixels
-from directshape_torch.observation.refinable import check_fit, check_no_tangents, refusals, without_empty_masks
+from directshape_torch.observation.refinable import check_fit, check_no_tangents, refusals
 from directshape_torch.refinement.outcome import as_they_came
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.result import RefinementResult
@@ -217,9 +216,7 @@ class DirectShapeRefiner(nn.Module):
 
     def _observe(self, frames: FrameBatch, detections: Detections) -> Observation:
         """What the images show of all cars; stereo points for the methods that use them."""
-        extents = scene_extents(detections)
-        detections = without_empty_masks(detections, extents)
-        seen = pack_pixels(frames, detections, self.config.sampling, extents)
+        seen = pack_pixels(frames, detections, self.config.sampling)
         if self.config.method in ("direct", "box_alignment"):
             return seen
         from directshape_torch.stereo_matching.disparity import with_disparity

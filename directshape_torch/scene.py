@@ -20,6 +20,7 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses
 from directshape_torch.geometry.ground_plane import GroundPlane
 from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.masks import MaskCrops, Masks
 from directshape_torch.numerics.checks import (
     check_finite,
     check_rotation,
@@ -35,17 +36,12 @@ Side = Literal["left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
 """The two images of a frame."""
 
-# Of B cars in an image: (B, H, W), or (H, W) and None for each.
-Masks = Tensor | Sequence[Tensor | None]
-
-MASK_THRESHOLD = 0.5
-"""Foreground probability above which an instance covers a pixel."""
-
 # Resampling by cubic kernels overshoots by a quarter at an edge; normalised images and 0..255 go far beyond.
 _BRIGHTEST = 1.5
 _DARKEST = -0.5
 # What times and places of a path must be told apart by.
 _FINE_S, _FINE_M = 1e-3, 0.01
+_MOST_TELLING = 100
 
 
 @dataclass(frozen=True)
@@ -154,16 +150,21 @@ class Occluders(TensorRecord):
 
     Attributes:
         frame_index: (M,) int64 or int32.
-        mask_left, mask_right: (M, H, W), bool or foreground probability in [0, 1]; 0 beyond the frame's own size.
+        mask_left, mask_right: M masks as in `Detections`.
         depth_m: (M,) distance along the optical axis, NaN where unknown.
         bottom_v: (M,) lower edge of the 2D box in the left image, pixels.
     """
 
     frame_index: Annotated[Tensor, Dense("M", kind="index")]
-    mask_left: Annotated[Tensor, Dense("M", "H", "W", kind="mask")]
-    mask_right: Annotated[Tensor, Dense("M", "H", "W", kind="mask")]
+    mask_left: MaskCrops
+    mask_right: MaskCrops
     depth_m: Annotated[Tensor, Dense("M")]
     bottom_v: Annotated[Tensor, Dense("M")]
+
+    def __post_init__(self) -> None:
+        _cut_masks(self)
+        super().__post_init__()
+        _check_mask_numbers(self.mask_left, self.mask_right, len(self.frame_index))
 
 
 @dataclass(frozen=True)
@@ -177,9 +178,9 @@ class Detections(TensorRecord):
         dimensions_hwl: (B, 3) height, width, length of the initial box, metres, above 0; a car with NaN fails alone.
         box_2d: (B, 4) left-image box (u_min, v_min, u_max, v_max), pixels.
         score: (B,) the detector's score, any scale.
-        mask_left, mask_right: (B, H, W) foreground probability in [0, 1], floating point or bool. 0 beyond the frame's
-            own size, for extents and areas of masks count the padding too.
-        has_mask_left, has_mask_right: (B,) bool; a mask that is absent is never read.
+        mask_left, mask_right: B masks, kept as crops; masks (B, H, W) or B of (H, W) and None are cut when they are
+            given (`MaskCrops.of`). They are 0 beyond the frame's own size, for extents and areas of masks count the
+            padding too. A car needs a left mask; a right one is a second opinion.
         occluders: other instances that may hide the cars, or None.
         pose_sigma: (B, 4) standard deviations of the detector's own error: along the viewing ray of the object origin
             (in the plane of the camera's x and z axes), across it in that plane, along the camera's y axis (metres),
@@ -193,8 +194,8 @@ class Detections(TensorRecord):
 
     Raises:
         InputError: wrong shapes or types, a rotation that is none, dimensions or standard deviations that are not
-            above 0, an `offset_sigma_px` that is below 0 or not finite, or two views of one track in one frame. Masks
-            with values above 1.5 (logits, 0..255) are refused when they are read, in a refinement.
+            above 0, an `offset_sigma_px` that is below 0 or not finite, two views of one track in one frame, or masks
+            of another number or with values above 1.5 (logits, 0..255).
     """
 
     # Other instances may hide any of the cars.
@@ -205,19 +206,17 @@ class Detections(TensorRecord):
     dimensions_hwl: Annotated[Tensor, Dense("B", 3)]
     box_2d: Annotated[Tensor, Dense("B", 4)]
     score: Annotated[Tensor, Dense("B")]
-    mask_left: Annotated[Tensor, Dense("B", "H", "W", kind="mask", cure="absent masks: zeros, and has_mask_left False")]
-    mask_right: Annotated[
-        Tensor, Dense("B", "H", "W", kind="mask", cure="absent masks: zeros, and has_mask_right False")
-    ]
-    has_mask_left: Annotated[Tensor, Dense("B", kind="flags")]
-    has_mask_right: Annotated[Tensor, Dense("B", kind="flags")]
+    mask_left: MaskCrops
+    mask_right: MaskCrops
     occluders: Occluders | None = None
     pose_sigma: Annotated[Tensor | None, Dense("B", 4)] = None
     offset_sigma_px: Annotated[Tensor | None, Dense("B")] = None
     track_id: Annotated[Tensor | None, Dense("B", kind="index")] = None
 
     def __post_init__(self) -> None:
+        _cut_masks(self)
         super().__post_init__()
+        _check_mask_numbers(self.mask_left, self.mask_right, len(self.frame_index))
         check_type("occluders", self.occluders, (Occluders, NoneType))
         has_pose = self.T_cam_obj.isfinite().flatten(1).all(dim=1)
         T_known = torch.where(has_pose[:, None, None], self.T_cam_obj, torch.eye(4).to(self.T_cam_obj))
@@ -264,12 +263,13 @@ class Detections(TensorRecord):
                 order, says the convention (`directshape_torch.geometry.box_formats`).
             convention: "kitti", "mmdet3d_camera", "mmdet3d_lidar", "nuscenes" or "opencv".
             mask_left, mask_right: (B, H, W) bool, uint8 (0 and 1, or 0..255) or foreground probability; or B entries
-                that are (H, W) or None. One of the two images is enough.
-            has_mask_left, has_mask_right: (B,) bool; default: where a mask has any pixel.
+                that are (H, W) or None; tensors or numpy arrays. Right masks may be left out, left ones not: a car
+                without a left mask is not refined.
+            has_mask_left, has_mask_right: (B,) bool, masks that are there, of which alone the pixels are read; default:
+                all of them.
             frame_index: (B,) default all 0.
             score: (B,) default all 1.
-            box_2d: (B, 4) u_min, v_min, u_max, v_max of the left image; default: around the left mask, or
-                where there is none around the right one, which is as high.
+            box_2d: (B, 4) u_min, v_min, u_max, v_max of the left image; default: around the left mask.
             T_cam_boxes: rigid motion from the frame of the boxes to the left camera, (4, 4) or (B, 4, 4). Camera
                 conventions do without where the boxes are in the left camera's frame; boxes in KITTI's own frame of
                 labels bring `camera.T_cam_ref`; LiDAR boxes need camera_from_lidar.
@@ -288,33 +288,51 @@ class Detections(TensorRecord):
             (tensor([ 1.0000,  1.6000, 20.0000]), tensor([[100.,  50., 179.,  79.]]))
         """
         T_cam_obj, dimensions_hwl = boxes_to_poses(boxes, convention, T_cam_boxes)
-        count, given = len(boxes), {"mask_left": mask_left, "mask_right": mask_right}
-        stacked = {name: _stacked(name, masks, count) for name, masks in given.items() if masks is not None}
-        if not stacked:
-            cure = "give mask_left, mask_right, or both; a car without a mask cannot be refined"
-            raise InputError("mask_left", f"masks of {count} cars in one image at least", "None", cure)
-        none = torch.zeros_like(next(iter(stacked.values())), dtype=torch.bool)
-        left, right = (stacked.get(name, none) for name in given)
-        has_left = left.flatten(1).any(dim=1) if has_mask_left is None else has_mask_left
-        has_right = right.flatten(1).any(dim=1) if has_mask_right is None else has_mask_right
-        if box_2d is None:
-            box_2d = torch.where(left.flatten(1).any(dim=1)[:, None], boxes_around(left), boxes_around(right)).to(boxes)
+        count = len(boxes)
+        if mask_left is None:
+            cure = "give mask_left; a car without a left mask is not refined"
+            raise InputError("mask_left", f"masks of {count} cars in the left image", "None", cure)
+        left = MaskCrops.of(mask_left, has_mask_left, "mask_left")
+        right = (
+            MaskCrops.none(count, left.size_hw, left.values)
+            if mask_right is None
+            else MaskCrops.of(mask_right, has_mask_right, "mask_right")
+        )
+        _check_mask_numbers(left, right, count)
         return cls(
             frame_index=torch.zeros(count, dtype=torch.long, device=boxes.device)
             if frame_index is None
             else frame_index,
             T_cam_obj=T_cam_obj,
             dimensions_hwl=dimensions_hwl,
-            box_2d=box_2d,
+            box_2d=left.box_2d.to(boxes) if box_2d is None else box_2d,
             score=boxes.new_ones(count) if score is None else score,
             mask_left=left,
             mask_right=right,
-            has_mask_left=has_left,
-            has_mask_right=has_right,
             occluders=occluders,
             pose_sigma=pose_sigma,
             track_id=track_id,
         )
+
+    @property
+    def has_mask_left(self) -> Tensor:
+        """(B,) bool, cars whose left mask has any pixel above one half."""
+        return self.mask_left.areas > 0
+
+    @property
+    def has_mask_right(self) -> Tensor:
+        """(B,) bool, cars whose right mask has any pixel above one half."""
+        return self.mask_right.areas > 0
+
+    def telling_rows(self, frame: int) -> list[int]:
+        """The cars of a frame that tell most of its rig and conventions: at most 100, in their order.
+
+        Cars with a left mask come first, then those of higher scores: detectors that write down whatever they have fill
+        a frame with thousands of boxes.
+        """
+        has_mask, score, of_frame = self.has_mask_left.tolist(), self.score.tolist(), self.frame_index.tolist()
+        rows = [row for row, number in enumerate(of_frame) if number == frame]
+        return sorted(sorted(rows, key=lambda row: (not has_mask[row], -score[row]))[:_MOST_TELLING])
 
     def __len__(self) -> int:
         return len(self.frame_index)
@@ -329,51 +347,19 @@ def _as_images(name: str, images: Tensor, like: Tensor) -> Tensor:
     return images.to(like.dtype) / 255 if is_bytes else images
 
 
-def _stacked(name: str, masks: Masks, count: int) -> Tensor:
-    """Masks (B, H, W) in bool or floating point."""
-    if not isinstance(masks, Tensor):
-        if not isinstance(masks, (list, tuple)):
-            raise InputError(name, "tensors", type(masks).__name__, "torch.as_tensor(masks), or a list with None")
-        for number, mask in enumerate(masks):
-            if mask is not None:
-                check_shape(f"{name}[{number}]", mask, ("H", "W"))
-        present = [mask for mask in masks if mask is not None]
-        if len(masks) != count or not present or len({mask.shape for mask in present}) > 1:
-            got = f"{len(masks)} entries of sizes {sorted({tuple(mask.shape) for mask in present})}"
-            cure = "where no car has a mask give torch.zeros(number of cars, H, W)"
-            raise InputError(name, f"{count} masks of one size (H, W), or None where a car has none", got, cure)
-        filled = [torch.zeros_like(present[0]) if mask is None else mask for mask in masks]
-        if len({mask.dtype for mask in filled}) == 1:
-            masks = torch.stack(filled)
-        else:
-            # Bytes of up to 255 beside bool or probabilities: each is read in its own units.
-            masks = torch.stack([_foreground(mask) for mask in filled])
-    if masks.dtype == torch.uint8:
-        check_shape(name, masks, (count, "H", "W"))
-    masks = _foreground(masks)
-    check_shape(name, masks, (count, "H", "W"), kind="mask")
-    return masks
+def _cut_masks(instances: Detections | Occluders) -> None:
+    """Crops in place of the masks of a record that came in another form."""
+    for name in ("mask_left", "mask_right"):
+        masks = getattr(instances, name)
+        if not isinstance(masks, MaskCrops):
+            object.__setattr__(instances, name, MaskCrops.of(masks, name=name))
 
 
-def _foreground(masks: Tensor) -> Tensor:
-    """Masks in bytes, 0 and 1 or shades of grey, as bool or probabilities; others as they are."""
-    if masks.dtype != torch.uint8:
-        return masks
-    return masks.bool() if not masks.numel() or int(masks.max()) <= 1 else masks.float() / 255
-
-
-def boxes_around(
-    masks: Tensor,  # (B, H, W)
-) -> Tensor:
-    """u_min, v_min, u_max, v_max (B, 4) of the pixels above 0.5, float64; NaN without any."""
-    inside = masks if masks.dtype == torch.bool else masks > MASK_THRESHOLD
-    spans = []
-    for axis in (1, 2):  # columns, then rows
-        seen = inside.any(dim=axis).int()
-        first, last = seen.argmax(dim=1), seen.shape[1] - 1 - seen.flip(1).argmax(dim=1)
-        spans.append(torch.stack([first, last], dim=1).double())
-    box = torch.stack(spans, dim=2).flatten(1)
-    return torch.where(inside.flatten(1).any(dim=1)[:, None], box, torch.nan)
+def _check_mask_numbers(left: MaskCrops, right: MaskCrops, count: int) -> None:
+    """Raise `InputError` unless there are so many masks in both images."""
+    for name, masks in (("mask_left", left), ("mask_right", right)):
+        if len(masks) != count:
+            raise InputError(name, f"{count} masks, one for each instance", f"{len(masks)}")
 
 
 def _check_motion(time_s: Tensor | None, T_world_cam: Tensor | None) -> None:

@@ -13,7 +13,7 @@ class Status(enum.Enum):
 
     converged = "the cost settled, or a further step promises less than half a percent of it"
     max_iterations = "the iterations ran out before the cost settled; the state is the best one found"
-    no_mask = "no instance mask in either image matches this detection; check masks, boxes and the matching threshold"
+    no_mask = "the car has no instance mask in the left image, which is needed; check the masks and their frame numbers"
     too_few_pixels = "fewer usable pixels than the configured minimum; the car is tiny, cut off or hidden"
     behind_camera = "the initial box lies behind or at the camera, or upside down; check frame and units of the pose"
     singular = "the normal equations are singular; add a prior, more pixels, or damping"

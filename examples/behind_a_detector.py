@@ -32,7 +32,7 @@ class DetectorOutput:
         boxes: (N, 7) as MMDetection3D has them in a camera frame: x, y, z, length, height, width, heading.
         box_2d: (N, 4) u_min, v_min, u_max, v_max in the left image, pixels.
         score: (N,).
-        mask_left, mask_right: (N, H, W) foreground probability in [0, 1], all zero where there is no mask.
+        mask_left, mask_right: (N, H, W) foreground probability in [0, 1]; left ones are needed, all zero for none.
     """
 
     frame_index: Tensor
@@ -88,8 +88,8 @@ class StoredDetector(nn.Module):
             boxes=poses_to_boxes(poses, loaded.detections.dimensions_hwl, "mmdet3d_camera"),
             box_2d=loaded.detections.box_2d,
             score=torch.tensor([line.score or 0.0 for line in lines]),
-            mask_left=loaded.detections.mask_left,
-            mask_right=loaded.detections.mask_right,
+            mask_left=loaded.detections.mask_left.dense(),
+            mask_right=loaded.detections.mask_right.dense(),
         )
 
     def forward(self, images_left: Tensor, images_right: Tensor) -> DetectorOutput:

@@ -117,7 +117,7 @@ class Scene:
     def _of(cls, frames: FrameBatch, detections: Detections, prior: PCAShapePrior, settings: Sequence[str]) -> Scene:
         """With standard deviations of the detector, and masks that are not clamped, which have no gradient."""
         sigma = detections.score.new_tensor([0.6, 0.2, 0.1, 0.1]).expand(len(detections), 4)
-        left, right = (x.clamp(0.1, 0.9) for x in (detections.mask_left, detections.mask_right))
+        left, right = (x.dense().clamp(0.1, 0.9) for x in (detections.mask_left, detections.mask_right))
         detections = replace(detections, pose_sigma=sigma, mask_left=left, mask_right=right)
         generator = torch.Generator().manual_seed(5)
         inputs = {"left image": frames.images_left, "right image": frames.images_right, "masks": left}
@@ -142,7 +142,7 @@ def refined(scene: Scene, config: RefinerConfig, by: Mapping[str, Tensor]) -> Re
         T_cam_obj=T_cam_obj,
         dimensions_hwl=d.dimensions_hwl + shift[:, 4:],
         pose_sigma=None if d.pose_sigma is None else d.pose_sigma * (1 + at["pose_sigma"]),
-        mask_left=d.mask_left + at["masks"] * scene.directions["masks"],
+        mask_left=d.mask_left.dense() + at["masks"] * scene.directions["masks"],
     )
     frames = replace(
         frames,

@@ -22,8 +22,8 @@ import numpy as np
 from command_line import run_command
 
 from directshape_torch.geometry.image_boxes import box_iou
-from directshape_torch.io.frame_detections import match_one_to_one
 from directshape_torch.io.kitti_labels import read_objects
+from directshape_torch.io.mask_matching import MIN_OVERLAP, assign
 
 _CAR = 3  # COCO's
 # More than MOTS has instances: for what has no mask, a number for each line of each frame.
@@ -78,8 +78,9 @@ def _numbered(file: Path, frame: int, cars: dict[int, list[float]]) -> list[str]
     """The lines of a file with their frame and track before them."""
     objects = read_objects(file)
     boxes = np.array([each.box_2d if each.type == "Car" else (0.0,) * 4 for each in objects]).reshape(-1, 4)
-    found, _ = match_one_to_one(box_iou(boxes, np.array([*cars.values()]).reshape(-1, 4)))
-    numbers = [list(cars)[k] if k >= 0 else _UNKNOWN * (frame + 1) + row for row, k in enumerate(found.tolist())]
+    overlap = box_iou(boxes, np.array([*cars.values()]).reshape(-1, 4))
+    found = assign(np.where(overlap >= MIN_OVERLAP, overlap, 0.0))
+    numbers = [list(cars)[k] if k >= 0 else _UNKNOWN * (frame + 1) + row for row, k in enumerate(found)]
     return [f"{frame} {number} {each.raw_line}\n" for number, each in zip(numbers, objects, strict=True)]
 
 

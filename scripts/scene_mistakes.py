@@ -22,7 +22,7 @@ from directshape_torch import Detections, FrameBatch, check_scene
 from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import open_dataset
-from directshape_torch.scene import boxes_around
+from directshape_torch.masks import MaskCrops
 from directshape_torch.scene_check.finding import CheckReport
 
 Scene = tuple[FrameBatch, Detections]
@@ -123,8 +123,8 @@ def _masks(change: Callable[[Tensor], Tensor]) -> Callable[..., Scene]:
     """Of both sides; masks and 2D boxes around them as a program would make them from the wrong masks."""
 
     def make(frames: FrameBatch, d: Detections) -> Scene:
-        both = {f"mask_{side}": change(getattr(d, f"mask_{side}")) for side in ("left", "right")}
-        return frames, replace(d, **both, box_2d=boxes_around(both["mask_left"]).to(d.box_2d), occluders=None)
+        left, right = (MaskCrops.of(change(masks.dense())) for masks in (d.mask_left, d.mask_right))
+        return frames, replace(d, mask_left=left, mask_right=right, box_2d=left.box_2d.to(d.box_2d), occluders=None)
 
     return make
 
@@ -137,22 +137,14 @@ def _other_order(frames: FrameBatch, d: Detections) -> Scene:
         order[rows] = rows.roll(1)
     return frames, replace(
         d,
-        mask_left=d.mask_left[order],
-        mask_right=d.mask_right[order],
-        has_mask_left=d.has_mask_left[order],
-        has_mask_right=d.has_mask_right[order],
+        mask_left=d.mask_left.rows(order),
+        mask_right=d.mask_right.rows(order),
         box_2d=d.box_2d[order],
     )
 
 
 def _sides(frames: FrameBatch, d: Detections) -> Scene:
-    return frames, replace(
-        d,
-        mask_left=d.mask_right,
-        mask_right=d.mask_left,
-        has_mask_left=d.has_mask_right,
-        has_mask_right=d.has_mask_left,
-    )
+    return frames, replace(d, mask_left=d.mask_right, mask_right=d.mask_left)
 
 
 MISTAKES: dict[str, Mistake] = {
@@ -221,7 +213,7 @@ def scene(root: Path, detections: Path, masks: Path, count: int = 6, first: int 
     dataset = open_dataset("kitti", root, detections, masks, ground="camera_height")
     frames, found = collate([dataset.load(frame_id) for frame_id in dataset.frame_ids[first : first + count]])
     # As `Detections.from_boxes` makes them: boxes of a file may be projections of the labels, and tell too much.
-    return frames, replace(found, box_2d=boxes_around(found.mask_left).to(found.box_2d))
+    return frames, replace(found, box_2d=found.mask_left.box_2d.to(found.box_2d))
 
 
 def main() -> None:

@@ -126,7 +126,7 @@ def test_a_nan_image_gives_no_nan_gradient(inputs: StreetInputs, mode: str) -> N
     frames, detections = _two_frames(inputs)
     images = frames.images_left.clone()
     images[1] = torch.nan
-    mask = detections.mask_left.clone().requires_grad_()
+    mask = detections.mask_left.dense().requires_grad_()
     refiner = DirectShapeRefiner(inputs.prior, with_mode(mode))
     result = refiner(replace(frames, images_left=images), replace(detections, mask_left=mask))
     assert not result.refined[detections.frame_index == 1].any()

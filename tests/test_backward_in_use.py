@@ -12,7 +12,7 @@ import torch
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import DEFAULT
 from helpers.street_inputs import SETTLED, StreetInputs, gradient_by, summary, with_mode
-from helpers.synthetic_scene import cached_street, disturbed
+from helpers.synthetic_scene import cached_street, disturbed, masked
 from torch import Tensor
 
 from directshape_torch.config import StageConfig
@@ -103,8 +103,7 @@ def test_weights_of_one_change_nothing_and_others_do(inputs: StreetInputs) -> No
 def test_a_misspelt_term_is_an_error_that_lists_the_names(inputs: StreetInputs) -> None:
     refiner = DirectShapeRefiner(inputs.prior, DEFAULT)
     weights = {"silhouete_left": torch.ones(len(inputs.detections), dtype=torch.float64)}
-    hidden = replace(inputs.detections, has_mask_left=inputs.detections.has_mask_left & False)
-    hidden = replace(hidden, has_mask_right=hidden.has_mask_left)
+    hidden = masked(inputs.detections, inputs.detections.has_mask_left & False)
     for detections in (inputs.detections, hidden):  # a slip is a slip in frames without a usable car as well
         with pytest.raises(InputError, match=r"silhouette_left, silhouette_right.*'silhouete_left'"):
             refiner(inputs.scene.frames, detections, weights)

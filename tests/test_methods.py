@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 from helpers.problems import DEFAULT
-from helpers.synthetic_scene import disturbed, joined_detections, joined_frames, measured_street, select
+from helpers.synthetic_scene import disturbed, joined_detections, joined_frames, masked, measured_street, select
 from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig, RefinerConfig
@@ -121,7 +121,7 @@ def test_combined_without_points_is_direct() -> None:
 def test_no_mask_is_no_obstacle_for_the_point_cloud() -> None:
     frames, detections = scene_of()
     absent = torch.zeros_like(detections.has_mask_left)
-    bare = replace(detections, has_mask_left=absent, has_mask_right=absent)
+    bare = masked(detections, absent, absent)
     assert all(status.is_refined for status in refine(GEOMETRIC, frames, bare).status)
     assert refine(COMBINED, frames, bare).status == [Status.no_mask] * 2
 

@@ -82,7 +82,7 @@ def _first_frame_of(name: str) -> tuple[FrameBatch, Detections]:
     masks = root / "training" / "masks"
     dataset = open_dataset("kitti", root, root / "detections" / SETS[name], masks, dtype=torch.float64)
     loaded = dataset.load(dataset.frame_ids[0])
-    seen = loaded.detections.mask_left.flatten(1).sum(dim=1) > 200
+    seen = loaded.detections.mask_left.dense().flatten(1).sum(dim=1) > 200
     return loaded.frame, select(loaded.detections, seen.nonzero()[:, 0])
 
 
@@ -254,7 +254,7 @@ def _biased_street(bias_px: int, rows: int = 0) -> tuple[FrameBatch, Detections]
         images_right=shifted(scene.frames.images_right),
         camera=replace(camera, disparity_field=field),
     )
-    return frames, replace(scene.detections, mask_right=shifted(scene.detections.mask_right))
+    return frames, replace(scene.detections, mask_right=shifted(scene.detections.mask_right.dense()))
 
 
 def test_a_field_that_is_known_brings_the_unbiased_energy_back() -> None:

@@ -19,6 +19,7 @@ from helpers.synthetic_scene import (
     disturbed,
     joined_detections,
     joined_frames,
+    masked,
     select,
     street,
 )
@@ -182,10 +183,8 @@ def test_two_cars_of_one_shape_are_told_apart_by_their_looks(next_view_weight: f
 
 def test_a_view_without_a_mask_touches_nothing_else() -> None:
     _, detections, _ = drive()
-    unmasked = replace(
-        detections, has_mask_left=detections.has_mask_left.clone(), has_mask_right=detections.has_mask_right.clone()
-    )
-    unmasked.has_mask_left[2] = unmasked.has_mask_right[2] = False
+    present = torch.arange(len(detections)) != 2
+    unmasked = masked(detections, present, present)
     broken = refined(unmasked, [0, 1] * 3)
     assert broken.status[2] == Status.no_mask
     assert torch.equal(broken.T_cam_obj[2], detections.T_cam_obj[2])
@@ -327,7 +326,7 @@ def test_gradients_of_a_track_are_those_of_differences(
     if time_s is not None:
         frames = replace(frames, time_s=torch.tensor(time_s, dtype=torch.float64))
     # The same picture twice: a minimum without a kink.
-    first = replace(disturbed(scene.detections), mask_left=scene.detections.mask_left.clamp(0.2, 0.8))
+    first = replace(disturbed(scene.detections), mask_left=scene.detections.mask_left.dense().clamp(0.2, 0.8))
     first = select(first, torch.tensor([0]))
     track = replace(joined_detections([first, first], (120, 160)), track_id=torch.tensor([5, 5]))
     direction = 0.02 * torch.randn(frames.images_right.shape, generator=torch.Generator().manual_seed(5)).double()
@@ -360,7 +359,7 @@ def test_implicit_gradients_pass_through_a_next_view_that_shows_the_car_elsewher
     # Pictures so smooth that a minimum sits on no kink between pixels.
     left, right = (gaussian_blur2d(x, (31, 31), (6.0, 6.0)) for x in (frames.images_left, frames.images_right))
     boxes = disturbed(joined_detections([view.detections for view in seen], (120, 160)))
-    boxes = replace(boxes, mask_left=boxes.mask_left.clamp(0.2, 0.8), track_id=torch.tensor([5, 5]))
+    boxes = replace(boxes, mask_left=boxes.mask_left.dense().clamp(0.2, 0.8), track_id=torch.tensor([5, 5]))
     direction = 0.1 * torch.randn(left.shape, generator=torch.Generator().manual_seed(5)).double()
     # The picture of the later view alone changes.
     direction[0] = 0

@@ -39,6 +39,7 @@ from directshape_torch.io.run_folder import (
 from directshape_torch.io.run_manifest import FrameEntry, hash_bytes
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refinement.result import KittiBoxes, RefinementResult
+from directshape_torch.status import Status
 
 if TYPE_CHECKING:
     import trimesh
@@ -142,7 +143,7 @@ def _shape_arrays(loaded: LoadedFrame, result: RefinementResult, boxes: KittiBox
         covariances=_numpy(result.covariance),
         covariances_ref=_numpy(result.covariance_xyz_yaw),
         statuses=tuple(status.name for status in result.status),
-        messages=tuple(status.value for status in result.status),
+        messages=_messages(loaded, result),
         term_names=result.term_names,
         costs_before=_numpy(result.cost_before),
         costs_after=_numpy(result.cost_after),
@@ -162,6 +163,13 @@ def _shape_arrays(loaded: LoadedFrame, result: RefinementResult, boxes: KittiBox
         profile_costs_before=_numpy(result.profile.cost_before),
         profile_costs_after=_numpy(result.profile.cost_after),
     )
+
+
+def _messages(loaded: LoadedFrame, result: RefinementResult) -> tuple[str, ...]:
+    """What each car's status says; where its mask was looked for among those of a frame, why it has none."""
+    reasons = loaded.no_mask_reasons or ("",) * len(result)
+    is_missing = [status is Status.no_mask and reason for status, reason in zip(result.status, reasons, strict=True)]
+    return tuple(reason or status.value for status, reason in zip(result.status, is_missing, strict=True))
 
 
 def _tracks(loaded: LoadedFrame) -> tuple[str, ...]:

@@ -20,6 +20,8 @@ from directshape_torch.status import Status
 TIMINGS = "timings.json"
 TIMINGS_SCHEMA_VERSION = 1
 _CPU = torch.device("cpu")
+# Cars without a mask that a warning names.
+_NAMED = 3
 
 
 @dataclass(frozen=True)
@@ -194,17 +196,28 @@ def find_warnings(frames: Mapping[str, Mapping[str, Any]], classes: Sequence[str
             f"none of the {num_lines} input lines is of class {', '.join(classes)} with a 3D box: nothing was refined"
         )
     elif num_cars and no_mask == num_cars:
-        found.append(f"none of the {num_cars} cars has a mask in either image: check the masks and their frame numbers")
+        found.append(f"none of the {num_cars} cars has a mask in the left image: check masks and their frame numbers")
     elif num_cars and no_camera == num_cars:
         found.append(f"all {num_cars} initial boxes lie behind or at the camera: check the frame of the detections")
     elif num_cars and 2 * refined < num_cars:
         found.append(f"only {refined} of {num_cars} cars were refined: see the statuses")
-    if num_cars > no_mask and not sum(entry.get("masks_left", 0) for entry in done):
-        found.append("no car has a mask in the left image: check the masks of that side")
+    if 0 < no_mask < num_cars:
+        found.append(f"{no_mask} of {num_cars} cars have no mask in the left image: {_reasons(frames)}")
     guessed = sum(entry.get("ground_source") == "camera_height" for entry in done)
     if num_cars and guessed:
         found.append(f"the ground of {guessed} of {len(done)} frames is only the camera height's: give plane files")
     return tuple(found)
+
+
+def _reasons(frames: Mapping[str, Mapping[str, Any]]) -> str:
+    """Why the first cars have no mask."""
+    every = [
+        f"line {line} of {frame_id}: {reason}"
+        for frame_id, entry in frames.items()
+        for line, reason in entry.get("no_mask", {}).items()
+    ]
+    more = f"; {len(every) - _NAMED} more in summary.json" if len(every) > _NAMED else ""
+    return "; ".join(every[:_NAMED]) + more
 
 
 def format_summary(summary: RunSummary) -> str:

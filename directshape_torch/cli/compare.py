@@ -2,8 +2,8 @@
 
 Compare result files before and after a refinement with labels: centre, yaw, bird's-eye and 3D overlap, shares above 0.7
 and made worse by 0.05, for all detections and by distance, with n and bootstrap intervals over cars. A detection takes
-the label of largest 2D overlap (at least 0.3, one to one). Counted are Car labels at least 25 px high, occluded <= 1,
-truncated <= 0.5.
+the label of largest 2D overlap (at least 0.3, one to one), without a 2D box the nearest one within 4 m. Counted are Car
+labels at least 25 px high, occluded <= 1, truncated <= 0.5.
 """
 
 from __future__ import annotations

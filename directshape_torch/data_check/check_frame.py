@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, DirectShapeError
+from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.frame_detections import match_masks
 from directshape_torch.io.frame_layout import FrameFiles
 from directshape_torch.io.image_files import as_pair, read_rgb
 from directshape_torch.io.instance_masks import InstanceMask, MaskSizeError
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.mask_matching import MIN_OVERLAP, assign
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.scene import SIDES
 from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence, Pair
@@ -118,20 +119,24 @@ def _evidence(
         _columns([o.box_2d for o in cars], 4),
     )
     of_cars = {side: [mask for mask in masks or [] if mask.is_car and mask.side == side] for side in SIDES}
-    matches = {side: match_masks(boxes.box_2d, of_side) for side, of_side in of_cars.items()}
-    own = {side: [None if k < 0 else of_cars[side][k] for k in matches[side][0].tolist()] for side in SIDES}
+    around = {side: _columns([mask.mask_box for mask in of_side], 4) for side, of_side in of_cars.items()}
+    overlap = {side: np.nan_to_num(box_iou(boxes.box_2d, around[side])) for side in SIDES}
+    matches = {side: assign(np.where(each >= MIN_OVERLAP, each, 0.0)) for side, each in overlap.items()}
+    own = {side: [None if k < 0 else of_cars[side][k] for k in matches[side]] for side in SIDES}
     nothing = (np.nan,) * 4
-    seen = _columns([box for mask in of_cars["left"] for box in (mask.mask_box, mask.box)], 4)
     return FrameEvidence(
         frame_id=frame_id,
         boxes=boxes,
         mask_boxes={
             side: _columns([nothing if mask is None else mask.mask_box for mask in own[side]], 4) for side in SIDES
         },
-        overlap={side: matches[side][1] for side in SIDES},
+        overlap={
+            side: np.array([overlap[side][row, k] if k >= 0 else 0.0 for row, k in enumerate(matches[side])])
+            for side in SIDES
+        },
         num_masks={side: len(of_cars[side]) for side in SIDES},
-        seen=(seen,) * len(boxes),
-        masks=tuple(None if mask is None else np.asarray(mask.probability > 0.5) for mask in own["left"]),
+        seen=(around["left"],) * len(boxes),
+        masks=tuple(None if mask is None else mask.whole(size_hw) for mask in own["left"]),
         camera=camera,
         size_hw=size_hw,
         has_masks=masks is not None,

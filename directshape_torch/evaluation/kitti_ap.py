@@ -80,7 +80,8 @@ def evaluate_kitti(
 
     Raises:
         DataFormatError: a folder, a label file of the split or a line is missing or damaged, or a result has no score.
-        InputError: no frame has labels, or none has results, or the class occurs in neither.
+        InputError: no frame has labels, or none has results, or the class occurs in neither, or no detection has a
+            2D box.
     """
     labels, results = _files(labels_dir, "labels"), _files(results_dir, "results")
     if not labels:
@@ -96,6 +97,11 @@ def evaluate_kitti(
     occurring = sorted({each.type for pair in pairs for objects in pair for each in objects})
     if object_type.lower() not in map(str.lower, occurring):
         raise InputError("object_type", f"a class of these files: {', '.join(occurring) or 'none'}", object_type)
+    detected = [each for _, objects in pairs for each in objects if each.type.lower() == object_type.lower()]
+    if detected and all(each.box_2d[3] <= each.box_2d[1] for each in detected):
+        expected = "2D boxes in the image, whose height says by KITTI's rules whether a detection counts"
+        cure = "write them into the files, or use 'directshape compare', which needs none"
+        raise InputError("results", expected, f"none in {len(detected)} detections", cure)
     return replace(
         score_frames(pairs, object_type),
         num_frames_without_results=len(frame_ids) - len(with_results),

@@ -15,6 +15,8 @@ from directshape_torch.io.frame_layout import frames_among
 from directshape_torch.io.kitti_labels import KittiObject
 
 _MINIMUM_IOU_2D = 0.3
+# Within which a detection without a 2D box takes a label, metres along the ground.
+_REACH_M = 4.0
 # Of labels that count: KITTI's level 1 is partly occluded; the share outside of the image.
 _LEAST_HEIGHT_PX, _MOST_OCCLUDED, _MOST_TRUNCATED = 25.0, 1, 0.5
 
@@ -33,11 +35,16 @@ def is_counted(label: KittiObject, types: Collection[str] = ("Car",)) -> bool:
 def match_to_labels(detections: Sequence[KittiObject], labels: Sequence[KittiObject]) -> dict[int, KittiObject]:
     """The label of each detection that has one, by its place: largest 2D overlap of at least 0.3 first, one to one.
 
-    Labels of every class with a 3D box compete, so that a detection of a van is not given to the car behind it; which
-    of the matched labels count is another question (`is_counted`). Of equal overlaps the first detection's is taken.
+    A detection whose 2D box touches no label's, as LiDAR detectors write -1 or zeros there, takes the nearest label
+    within 4 m instead. Labels of every class with a 3D box compete, so that a detection of a van is not given to the
+    car behind it; which of the matched labels count is another question (`is_counted`). Of equal overlaps the first
+    detection's is taken.
     """
     known = [label for label in labels if label.has_box_3d]
     overlap = box_iou(_image_boxes(detections), _image_boxes(known))
+    touches = (overlap > 0).any(axis=1, keepdims=True)
+    # Above all closenesses, so that 2D overlaps come first.
+    overlap = np.where(touches, np.where(overlap >= _MINIMUM_IOU_2D, 1 + overlap, 0), _closeness(detections, known))
     label_of: dict[int, int] = {}
     for place in np.argsort(-overlap, axis=None, kind="stable").tolist():
         row, column = divmod(place, len(known))
@@ -46,6 +53,13 @@ def match_to_labels(detections: Sequence[KittiObject], labels: Sequence[KittiObj
         if row not in label_of and column not in label_of.values():
             label_of[row] = column
     return {row: known[column] for row, column in sorted(label_of.items())}
+
+
+def _closeness(detections: Sequence[KittiObject], labels: Sequence[KittiObject]) -> NDArray[np.float64]:
+    """One (B, L) at the place of a label, and the least overlap at the end of the reach."""
+    places = [np.array([o.location_ref for o in some]).reshape(-1, 3)[:, [0, 2]] for some in (detections, labels)]
+    distance = np.linalg.norm(places[0][:, None] - places[1][None], axis=-1)
+    return np.asarray((1 - (1 - _MINIMUM_IOU_2D) * distance / _REACH_M).clip(0))
 
 
 def _image_boxes(objects: Sequence[KittiObject]) -> NDArray[np.float64]:

@@ -15,10 +15,10 @@ from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.projection import depth_from_disparity, rays_from_pixels
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.frame_detections import match_masks
 from directshape_torch.io.image_files import read_disparity, read_single_channel
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.mask_matching import match_masks
 from directshape_torch.refinement.ray_cast import cast
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState
@@ -162,7 +162,7 @@ def segments_of(
 ) -> dict[int, SegmentTruth]:  # by line number of the label
     """The segments of the labels of a frame that have a mask with known depths in it.
 
-    The segment of a label is the mask of the left image of largest overlap with its 2D box (at least 0.3, one to one).
+    The segment of a label is the mask of the left image that is matched to it (`io.mask_matching`).
 
     Args:
         path: the frame's map, in one of the folders of `folder_of_maps`.
@@ -175,12 +175,11 @@ def segments_of(
     """
     depth = read_depth(path) if path.parent.name == "depth_2" else _depth_of(read_disparity(path), camera)
     found = [mask for mask in masks.read(path.stem, depth.shape) if mask.side == "left"]
-    boxes = np.array([label.box_2d for label in labels], dtype=np.float64).reshape(-1, 4)
     truths: dict[int, SegmentTruth] = {}
-    for label, index in zip(labels, match_masks(boxes, found)[0], strict=True):
-        if index >= 0:
-            inside = np.asarray(found[index].probability) > 0.5
-            truth = segment_truth(f"left mask {found[index].instance_id}", depth, inside, camera)
+    matches = match_masks(labels, found, camera, depth.shape, frozenset(label.type for label in labels))
+    for label, mask in zip(labels, matches.left, strict=True):
+        if mask is not None:
+            truth = segment_truth(f"left mask {mask.instance_id}", depth, mask.whole(depth.shape), camera)
             if len(truth.points_cam):
                 truths[label.line_number] = truth
     return truths

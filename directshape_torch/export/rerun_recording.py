@@ -17,8 +17,8 @@ from directshape_torch.export.frame_source import Exporter, FrameSource
 from directshape_torch.export.painted_cars import ground_grid
 from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import MASK_THRESHOLD
 from directshape_torch.stereo_matching.disparity import rgb8
 from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Colour
 from directshape_torch.visualize.drawn_car import cars_of_result
@@ -133,7 +133,7 @@ def _log_images(stream: _Stream, loaded: LoadedFrame) -> None:
     sides = ((_LEFT, frame.images_left, detections.mask_left), (_RIGHT, frame.images_right, detections.mask_right))
     for entity, images, masks in sides:
         stream.log(entity, rr.Image(rgb8(images[0])).compress(jpeg_quality=_JPEG_QUALITY))
-        numbers = np.zeros(tuple(masks.shape[1:]), dtype=np.uint16)
+        numbers = np.zeros(masks.size_hw, dtype=np.uint16)
         for mask, detected in zip(masks, loaded.detected_objects, strict=True):
             numbers[(mask > MASK_THRESHOLD).cpu().numpy()] = detected.line_number
         stream.log(f"{entity}/masks", rr.SegmentationImage(numbers, opacity=_MASK_OPACITY))

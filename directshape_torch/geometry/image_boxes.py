@@ -38,7 +38,17 @@ def project_boxes(
     camera: StereoCamera,  # of one frame
     size_hw: tuple[int, int],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # (B, 4), (B, 4)
-    """2D boxes around 3D boxes in the left and the right image, clipped to the image; no area where out of sight.
+    """2D boxes around 3D boxes in the left and the right image, clipped to the image; no area where out of sight."""
+    left, right = box_outlines(T_cam_obj, dimensions_hwl, camera)
+    return enclosing_boxes(left, size_hw), enclosing_boxes(right, size_hw)
+
+
+def box_outlines(
+    T_cam_obj: Tensor,  # (B, 4, 4)
+    dimensions_hwl: Tensor,  # (B, 3) metres
+    camera: StereoCamera,  # of one frame
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # (B, 24, 2), (B, 24, 2)
+    """The ends of the edges of 3D boxes in the left and the right image, pixels; NaN for edges that are out of sight.
 
     The right one goes through the residual disparity field of the rig, if there is one. What is behind the camera is
     cut away 0.5 m in front of it.
@@ -51,10 +61,9 @@ def project_boxes(
     field = camera.disparity_field
     offset = () if field is None else field.offsets(uv_left)
     right = warp_to_right(rays_from_pixels(uv_left, K_left), points_cam[..., 2], K_right, T_right_cam, *offset)
-    return (
-        _enclosing_box(uv_left, in_front, size_hw),
-        _enclosing_box(right.uv_right, in_front & right.in_front, size_hw),
-    )
+    seen = (uv_left, in_front), (right.uv_right, in_front & right.in_front)
+    left, right_uv = (torch.where(valid[..., None], uv, torch.nan).cpu().numpy() for uv, valid in seen)
+    return left, right_uv
 
 
 def _visible_edge_ends(corners_cam: Tensor) -> Tensor:
@@ -71,11 +80,13 @@ def _visible_edge_ends(corners_cam: Tensor) -> Tensor:
     return torch.cat([clipped(start, end), clipped(end, start)], dim=1)
 
 
-def _enclosing_box(uv: Tensor, valid: Tensor, size_hw: tuple[int, int]) -> NDArray[np.float64]:
-    big = torch.full_like(uv, float("inf"))
-    low = torch.where(valid[..., None], uv, big).amin(dim=1)
-    high = torch.where(valid[..., None], uv, -big).amax(dim=1)
-    limit = uv.new_tensor([size_hw[1] - 1, size_hw[0] - 1])
-    low = torch.minimum(low.clamp(min=0), limit)
-    high = torch.minimum(high.clamp(min=0), limit)
-    return np.asarray(torch.cat([low, high], dim=-1).cpu().numpy())
+def enclosing_boxes(
+    outlines: NDArray[np.float64],  # (B, P, 2) pixels, NaN where out of sight
+    size_hw: tuple[int, int],
+) -> NDArray[np.float64]:  # (B, 4)
+    """The boxes around points, clipped to the image; no area where all of them are out of sight."""
+    limit = np.array([size_hw[1] - 1.0, size_hw[0] - 1.0])
+    known = np.isfinite(outlines)
+    low = np.where(known, outlines, np.inf).min(axis=1).clip(0, limit)
+    high = np.where(known, outlines, -np.inf).max(axis=1).clip(0, limit)
+    return np.concatenate([low, high], axis=-1)

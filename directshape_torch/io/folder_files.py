@@ -6,7 +6,7 @@ The frame of boxes and planes is the left camera's: `ref` is `cam`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,8 @@ from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.image_boxes import project_boxes
 from directshape_torch.io.instance_masks import (
     InstanceMask,
-    check_count,
     read_mask,
+    within_memory,
 )
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera, upright_plane
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
@@ -205,17 +205,16 @@ def _projected(rig_path: Path, hwl: _Triple, bottom: _Triple, yaw: float) -> tup
 
 def masks_of(path: Path, root: Path, size_hw: tuple[int, int]) -> list[InstanceMask]:
     """The masks of a frame: paths of 8-bit PNG files from `root`, or COCO segmentations."""
-    objects, found = read_frame(path).objects, []
-    check_count(path, len(objects), size_hw)
+    return within_memory(path, _each_mask(path, root, size_hw))
+
+
+def _each_mask(path: Path, root: Path, size_hw: tuple[int, int]) -> Iterator[InstanceMask | None]:
+    objects = read_frame(path).objects
     for side in SIDES:
         for row, entry in enumerate(objects):
-            if (mask := _mask_of(entry, side)) is None:
-                continue
-            probability = read_mask(path, f"mask_{side} of objects[{row}]", mask, size_hw, root)
-            box, is_car = entry.box_2d if side == "left" else None, entry.object_class == _CAR
-            if (probability > 0.5).any():
-                found.append(InstanceMask(side, row, is_car, probability, box, row=row))
-    return found
+            if (said := _mask_of(entry, side)) is not None:
+                probability = read_mask(path, f"mask_{side} of objects[{row}]", said, size_hw, root)
+                yield InstanceMask.found(side, row, entry.object_class == _CAR, probability, row=row)
 
 
 def mask_files(path: Path, root: Path) -> tuple[Path, ...]:

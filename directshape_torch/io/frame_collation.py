@@ -13,6 +13,7 @@ from torch.nn.functional import pad
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.masks import MaskCrops
 from directshape_torch.scene import Detections, FrameBatch, Occluders
 
 Size = tuple[int, int]  # height and width
@@ -100,13 +101,14 @@ def _filled(d: Detections, known: set[str], size_hw: Size) -> Detections:
         "offset_sigma_px": torch.zeros_like(d.T_cam_obj[:, 0, 0]),
         "track_id": torch.full_like(d.frame_index, -1),
     }
-    hidden = d.occluders or Occluders(d.frame_index[:0], d.mask_left[:0], d.mask_right[:0], d.score[:0], d.score[:0])
+    nobody = MaskCrops.none(0, d.mask_left.size_hw, d.mask_left.values)
+    hidden = d.occluders or Occluders(d.frame_index[:0], nobody, nobody, d.score[:0], d.score[:0])
     return replace(
         d,
-        mask_left=_padded(d.mask_left, size_hw),
-        mask_right=_padded(d.mask_right, size_hw),
+        mask_left=d.mask_left.padded(size_hw),
+        mask_right=d.mask_right.padded(size_hw),
         occluders=replace(
-            hidden, mask_left=_padded(hidden.mask_left, size_hw), mask_right=_padded(hidden.mask_right, size_hw)
+            hidden, mask_left=hidden.mask_left.padded(size_hw), mask_right=hidden.mask_right.padded(size_hw)
         ),
         **{name: nothing[name] for name in known if getattr(d, name) is None},
     )

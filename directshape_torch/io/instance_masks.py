@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, shown
 from directshape_torch.io.image_files import read_single_channel
+from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.scene import Side
 
 Box = tuple[float, float, float, float]
 """(u_min, v_min, u_max, v_max), pixels."""
 
-# All masks of an image together: four bytes each where they are soft.
-_MOST_PIXELS = 2**30
+# The parts of all masks of a frame together: four bytes each where they are soft.
+_MOST_PIXELS = 2**28
 # More than any outline has; rasterising takes memory for each pixel of it, wherever it lies.
 _LONGEST_OUTLINE_PX = 1e6
 # Five bits each, of runs that fit into 32.
@@ -32,28 +33,60 @@ class MaskSizeError(DataFormatError):
 
 @dataclass(frozen=True)
 class InstanceMask:
-    """One instance in one image; one without a pixel above one half says nothing about a car, and is none."""
+    """One instance in one image, by the part of the image where it is."""
 
     side: Side  # the image, "left" or "right"
     instance_id: int  # its number in the file; numbers of the two images need not agree
     is_car: bool  # whether it may be matched to a car
-    probability: NDArray[np.bool_] | NDArray[np.float32]  # (H, W), bool or float32 foreground probability in [0, 1]
-    file_box: Box | None = None  # what the file says of its 2D box
+    corner: tuple[int, int]  # u and v of the upper left pixel of the part
+    probability: NDArray[np.bool_] | NDArray[np.float32]  # (h, w), bool or float32 foreground probability in [0, 1]
+    score: float = 1.0  # the segmentation's, in [0, 1]
     # Number of the car over the frames of its sequence, -1 where `instance_id` is of one frame alone.
     track_id: int = -1
     # The detection that the file gives it to, counted from 0; None: found by overlap.
     row: int | None = None
 
+    @classmethod
+    def found(
+        cls, side: Side, instance_id: int, is_car: bool, probability: NDArray[Any], **known: Any
+    ) -> InstanceMask | None:
+        """The instance of a mask (H, W) of a whole image; None where no pixel is above one half.
+
+        Examples:
+            >>> mask = np.zeros((100, 200), bool)
+            >>> mask[40:50, 60:90] = True
+            >>> InstanceMask.found("left", 1, True, mask).mask_box
+            (60.0, 40.0, 89.0, 49.0)
+        """
+        if not (probability > MASK_THRESHOLD).any():
+            return None
+        rows, columns = (np.flatnonzero((probability != 0).any(axis=axis)) for axis in (1, 0))
+        part = probability[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        return cls(side, instance_id, is_car, (int(columns[0]), int(rows[0])), part.copy(), **known)
+
+    @cached_property
+    def inside(self) -> NDArray[np.bool_]:
+        """(h, w) the pixels of the part that are above one half."""
+        return np.asarray(self.probability > MASK_THRESHOLD)
+
     @cached_property
     def mask_box(self) -> Box:
-        """The smallest box around the mask, whole pixels, both ends belonging to it."""
-        rows, columns = (np.flatnonzero((self.probability > 0.5).any(axis=axis)) for axis in (1, 0))
-        return float(columns[0]), float(rows[0]), float(columns[-1]), float(rows[-1])
+        """The smallest box around the pixels above one half, both ends belonging to it."""
+        rows, columns = (np.flatnonzero(self.inside.any(axis=axis)) for axis in (1, 0))
+        u, v = self.corner
+        return float(u + columns[0]), float(v + rows[0]), float(u + columns[-1]), float(v + rows[-1])
 
     @property
-    def box(self) -> Box:
-        """The file's 2D box, else that of the mask."""
-        return self.file_box or self.mask_box
+    def crop_box(self) -> tuple[int, int, int, int]:
+        """u0, v0, u1, v1 of the part, half open."""
+        (u, v), (height, width) = self.corner, self.probability.shape
+        return u, v, u + width, v + height
+
+    def whole(self, size_hw: tuple[int, int]) -> NDArray[np.bool_]:
+        """The pixels (H, W) of the whole image that are above one half."""
+        image, (u0, v0, u1, v1) = np.zeros(size_hw, dtype=bool), self.crop_box
+        image[v0:v1, u0:u1] = self.inside
+        return image
 
 
 class MaskSource(Protocol):
@@ -92,15 +125,17 @@ def read_mask(path: Path, where: str, mask: Any, size_hw: tuple[int, int], root:
     return np.asarray(grey.astype(np.float32) / np.float32(np.iinfo(grey.dtype).max))
 
 
-def check_count(path: Path, count: int, size_hw: tuple[int, int]) -> None:
-    """Raise `DataFormatError` where so many masks of one image would not fit into memory."""
-    height, width = size_hw
-    if count * height * width > _MOST_PIXELS:
-        raise DataFormatError(
-            path,
-            f"{count} instances of {width} x {height} pixels, at most {_MOST_PIXELS // (height * width)} are read",
-            cure="keep the likely ones",
-        )
+def within_memory(path: Path, masks: Iterable[InstanceMask | None]) -> list[InstanceMask]:
+    """The masks of a frame, as they are made; raises `DataFormatError` where they would not fit into memory."""
+    kept, pixels = list[InstanceMask](), 0
+    for mask in masks:
+        if mask is not None:
+            kept.append(mask)
+            pixels += mask.probability.size
+        if pixels > _MOST_PIXELS:
+            problem = f"the first {len(kept)} instances cover over {_MOST_PIXELS} pixels"
+            raise DataFormatError(path, problem, cure="keep the likely ones")
+    return kept
 
 
 def check_size(path: Path, what: str, got_hw: Iterable[int], expected_hw: tuple[int, int]) -> None:

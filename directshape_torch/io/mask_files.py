@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,12 @@ from directshape_torch.io import folder_files
 from directshape_torch.io.frame_layout import FrameLayout
 from directshape_torch.io.image_files import find_image, read_single_channel
 from directshape_torch.io.instance_masks import (
-    Box,
     InstanceMask,
-    check_count,
     check_size,
     decode_segmentation,
     file_of_frame,
     read_mask,
+    within_memory,
 )
 from directshape_torch.scene import SIDES, Side
 
@@ -49,7 +48,8 @@ class FrameJsonMasks:
 
     def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
         path = self.path(frame_id)
-        return _from_coco(path, list(enumerate(read_coco_list(path))), size_hw, self.car_ids)
+        entries = list(enumerate(read_coco_list(path)))
+        return within_memory(path, _from_coco(path, entries, size_hw, self.car_ids))
 
     def files(self, frame_id: str) -> tuple[Path, ...]:
         path = self.path(frame_id)
@@ -90,7 +90,7 @@ class InstancePngMasks:
         for side, path in zip(SIDES, self.files(frame_id), strict=False):
             ids = read_single_channel(path)
             check_size(path, "the instance image", ids.shape, size_hw)
-            masks += self._instances(path, side, ids)
+            masks += within_memory(path, self._instances(side, ids))
         return masks
 
     def files(self, frame_id: str) -> tuple[Path, ...]:
@@ -101,15 +101,13 @@ class InstancePngMasks:
         """The file without which there are no masks of a frame."""
         return self.files(frame_id)[0]
 
-    def _instances(self, path: Path, side: Side, ids: NDArray[Any]) -> Iterable[InstanceMask]:
-        values = np.unique(ids).tolist()
-        check_count(path, len(values), (ids.shape[0], ids.shape[1]))
-        for value in values:
+    def _instances(self, side: Side, ids: NDArray[Any]) -> Iterable[InstanceMask | None]:
+        for value in np.unique(ids).tolist():
             category = value // _IDS_PER_CLASS
             if category in (0, _MOTS_IGNORE_CLASS):
                 continue
             track = value % _IDS_PER_CLASS if self.folders == _TRACKING_FOLDERS else -1
-            yield InstanceMask(side, value, category in self.car_ids, ids == value, track_id=track)
+            yield InstanceMask.found(side, value, category in self.car_ids, ids == value, track_id=track)
 
 
 @dataclass(frozen=True)
@@ -133,7 +131,7 @@ class CocoFileMasks:
         for side, path in zip(SIDES, (self.left, self.right), strict=True):
             if path is not None:
                 entries = _coco_by_frame(path).get(int(frame_id), [])
-                masks += _from_coco(path, entries, size_hw, self.car_ids, side)
+                masks += within_memory(path, _from_coco(path, entries, size_hw, self.car_ids, side))
         return masks
 
     def files(self, frame_id: str) -> tuple[Path, ...]:  # the same two files serve all frames
@@ -213,9 +211,7 @@ def _from_coco(
     size_hw: tuple[int, int],
     car_ids: frozenset[int],
     of_side: Side | None = None,  # None: each says of which it is
-) -> list[InstanceMask]:
-    check_count(path, len(entries), size_hw)
-    masks = []
+) -> Iterator[InstanceMask | None]:
     for index, entry in entries:
         side = of_side or entry.get("image")
         if side not in SIDES:
@@ -227,21 +223,17 @@ def _from_coco(
             if soft
             else decode_segmentation(path, where, entry.get("segmentation"), size_hw)
         )
-        if not (probability > 0.5).any():  # whatever else its entry says
-            continue
         try:
             number, is_car = int(entry.get("instance_id", index)), int(entry["category_id"]) in car_ids
-            masks.append(InstanceMask(side, number, is_car, probability, _file_box(entry)))
+            mask = InstanceMask.found(side, number, is_car, probability, score=_score(entry))
         except (KeyError, TypeError, ValueError) as error:
             raise DataFormatError(path, f"entry {index}: bad or missing field ({error!r})") from error
-    return masks
+        yield mask
 
 
-def _file_box(entry: Mapping[str, Any]) -> Box | None:
-    """COCO's [x, y, width, height], whose pixel k spans k .. k + 1, as a box of centres."""
-    if entry.get("bbox") is None:
-        return None
-    x, y, width, height = (float(value) for value in entry["bbox"])
-    if not np.isfinite([x, y, width, height]).all():
-        raise ValueError(f"bbox {entry['bbox']} is not finite")
-    return x, y, x + width - 1, y + height - 1
+def _score(entry: Mapping[str, Any]) -> float:
+    """The score of an entry; one without is as sure as the segmentation can be."""
+    score = float(entry.get("score", 1.0))
+    if not np.isfinite(score):
+        raise ValueError(f"score {entry['score']} is not finite")
+    return score

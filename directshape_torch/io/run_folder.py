@@ -120,6 +120,7 @@ def read_done(
 
 def frame_entry(shapes: ShapeArrays, record: FrameRecord) -> FrameEntry:
     """What `summary.json` says of a frame that is done."""
+    cars = zip(shapes.input_lines.tolist(), shapes.statuses, shapes.messages, strict=True)
     return {
         "state": "done",
         "lines": record.lines,
@@ -128,6 +129,7 @@ def frame_entry(shapes: ShapeArrays, record: FrameRecord) -> FrameEntry:
         "masks_right": record.masks_right,
         "ground_source": shapes.ground_source,
         "statuses": dict(Counter(shapes.statuses)),
+        "no_mask": {str(line): message for line, status, message in cars if status == Status.no_mask.name},
     }
 
 

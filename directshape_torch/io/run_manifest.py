@@ -57,6 +57,7 @@ class FrameEntry(_FrameState, total=False):
     masks_right: int
     ground_source: str
     statuses: dict[str, int]
+    no_mask: dict[str, str]
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from directshape_torch.io.kitti_calibration import camera_of_rig, plane_ref_to_c
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.layouts import folder_layout, object_layout, raw_layout, stereo2015_layout, tracking_layout
 from directshape_torch.io.mask_files import LayoutMasks
+from directshape_torch.io.mask_matching import with_image_boxes
 from directshape_torch.io.track_association import associate
 from directshape_torch.io.velodyne import in_image, read_scan
 from directshape_torch.scene import Detections, FrameBatch
@@ -63,6 +64,7 @@ class LoadedFrame:
     refined_rows: tuple[int, ...]
     labels: list[KittiObject] | None
     sequence: str | None = None
+    no_mask_reasons: tuple[str, ...] = ()
 
     @property
     def frame_id(self) -> str:
@@ -205,11 +207,13 @@ class StereoDataset:
         )
         objects = files.read_objects()
         masks = [] if self.masks is None else self.masks.read(frame_id, (height, width))
-        detections, rows, mask_tracks = build_detections(objects, masks, camera, (height, width), self.classes)
+        found = build_detections(objects, masks, camera, (height, width), self.classes)
+        detections, rows = found.detections, found.rows
         if self.tracks:
-            detections = replace(detections, track_id=self._track_id(frame_id, rows, mask_tracks))
+            detections = replace(detections, track_id=self._track_id(frame_id, rows, found.tracks))
         sequence = self.sequence_of(frame_id)
-        return LoadedFrame(frame, detections, objects, rows, files.read_labels(), sequence)
+        reasons = found.no_mask_reasons
+        return LoadedFrame(frame, detections, objects, rows, files.read_labels(), sequence, reasons)
 
     def scan(self, frame_id: str) -> tuple[Tensor, StereoCamera]:
         """All points (P, 3) of the LiDAR scan of a frame in its left camera, metres, float64, and that camera.
@@ -270,11 +274,18 @@ class StereoDataset:
             if self.layout.sequence_of(frame_id) == sequence:
                 # A file that cannot be read is reported when its turn comes.
                 with contextlib.suppress(DirectShapeError, OSError):
-                    objects[frame_id] = self.objects(frame_id)
+                    objects[frame_id] = self._objects_in_image(frame_id)
         given = {frame_id: [found.track_id for found in frame] for frame_id, frame in objects.items()}
         if any(track >= 0 for ids in given.values() for track in ids):
             return given
         return dict(zip(objects, associate(list(objects.values())), strict=True))
+
+    def _objects_in_image(self, frame_id: str) -> list[KittiObject]:
+        """The detections of a frame with 2D boxes of use, without a look at its images."""
+        camera = to_stereo_camera(self.layout.files(frame_id).read_calibration())
+        # The centre is near the middle of an image.
+        width, height = (2 * int(x) for x in camera.K_left[0, :2, 2])
+        return with_image_boxes(self.objects(frame_id), camera, (height, width))
 
     def _disparity(self, files: FrameFiles, size_hw: tuple[int, int]) -> Tensor | None:
         if self.disparity_dir is None:

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.geometry.image_boxes import box_iou
-from directshape_torch.io.frame_detections import match_one_to_one
 from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.mask_matching import assign
 
 # A car that is not found again within so many frames is a new one.
 _LONGEST_GAP = 2
+_LEAST_OVERLAP = 0.3
 # From one frame to the next a depth changes by less, detector's errors and oncoming traffic included.
 _DEPTH_RATIO = 1.5
 
@@ -54,9 +55,10 @@ def associate(frames: Sequence[Sequence[KittiObject]]) -> list[list[int]]:
     for frame, objects in enumerate(frames):
         tracks = [track for track in tracks if frame - track.frame <= _LONGEST_GAP + 1]
         found = [number for number, each in enumerate(objects) if each.has_box_3d]
-        partners, _ = match_one_to_one(_overlaps([objects[number] for number in found], tracks, frame))
+        overlap = _overlaps([objects[number] for number in found], tracks, frame)
+        partners = assign(np.where(overlap >= _LEAST_OVERLAP, overlap, 0.0))
         ids = [-1] * len(objects)
-        for number, partner in zip(found, partners.tolist(), strict=True):
+        for number, partner in zip(found, partners, strict=True):
             if partner >= 0:
                 track = tracks[partner].gone_on(objects[number], frame)
             else:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -13,6 +13,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.geometry.projection import project, rays_from_pixels, right_rays
 from directshape_torch.io.stereo_dataset import open_dataset
+from directshape_torch.masks import MaskCrops
 from directshape_torch.rows import Rays, Rows
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.field import field_of
@@ -85,8 +86,7 @@ def _detections_folder(root: Path) -> Path:
 
 def select_detections(d: Detections, rows: Tensor) -> Detections:
     """Some of the detections, in that order; a row may be repeated. Other instances stay as occluders."""
-    own = (field.name for field in fields(d) if isinstance(getattr(d, field.name), Tensor))
-    return replace(d, **{name: getattr(d, name)[rows] for name in own})
+    return d.rows(rows)
 
 
 def place_cars(
@@ -113,10 +113,8 @@ def place_cars(
         dimensions_hwl=prior.dimensions_mean_hwl.expand(count, 3).clone(),
         box_2d=box,
         score=torch.ones(count, dtype=T_cam_obj.dtype),
-        mask_left=masks["left"],
-        mask_right=masks["right"],
-        has_mask_left=masks["left"].flatten(1).any(dim=1),
-        has_mask_right=masks["right"].flatten(1).any(dim=1),
+        mask_left=MaskCrops.of(masks["left"]),
+        mask_right=MaskCrops.of(masks["right"]),
     )
 
 

@@ -69,7 +69,14 @@ class Record:
 
     def rows(self, index: Tensor) -> Self:
         """The rows `index` (M,) int64, in that order."""
-        return self._with(lambda value: value.index_select(0, index.to(value.device)), by_row=True)
+        chosen: dict[str, Any] = {}
+        for each in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, each.name)
+            if isinstance(value, Record) and each.name not in self.shared:
+                chosen[each.name] = value.rows(index)
+            elif isinstance(value, Tensor) and each.name not in self.shared:
+                chosen[each.name] = value.index_select(0, index.to(value.device))
+        return replace(self, **chosen)  # type: ignore[type-var]
 
     def _with(self, change: Callable[..., Tensor], *others: Self, by_row: bool = False) -> Self:
         """A copy with all tensors changed, each with its counterparts; `by_row`, but what is shared."""

@@ -16,16 +16,14 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.observation.extents import SceneExtents, scene_extents
+from directshape_torch.masks import MASK_THRESHOLD, MaskCrops
 from directshape_torch.rows import OcclusionMap
-from directshape_torch.scene import MASK_THRESHOLD, Detections, Side
+from directshape_torch.scene import Detections, Side
 
 OcclusionOrder = Literal["depth", "box_bottom"]
 
 
-def occlusion_map(
-    detections: Detections, side: Side, order: OcclusionOrder = "depth", extents: SceneExtents | None = None
-) -> OcclusionMap:
+def occlusion_map(detections: Detections, side: Side, order: OcclusionOrder = "depth") -> OcclusionMap:
     """What hides the B objects in one image.
 
     Args:
@@ -34,7 +32,6 @@ def occlusion_map(
         order: "depth": smaller depth of the object's origin; an instance of unknown depth (NaN, or not in front of the
             camera) goes by the boxes. "box_bottom": lower bottom edge of the left 2D box, as in the paper. Equals, and
             comparisons with NaN, hide nothing.
-        extents: of the masks of these detections, where they are known already.
 
     Raises:
         InputError: unknown side or order.
@@ -50,8 +47,8 @@ def occlusion_map(
     if side not in ("left", "right"):
         raise InputError("side", "'left' or 'right'", repr(side))
     frame, numbers, limits = _instances(detections, order)
-    extents = scene_extents(detections) if extents is None else extents
-    boxes = (extents.boxes_left if side == "left" else extents.boxes_right).tolist()
+    masks = _masks(detections, side)
+    boxes, crops = masks.boxes.tolist(), [masks.crop(row) for row in range(len(masks))]
     shown = [box for box in boxes if box[2] > box[0]] or [(0, 0, 0, 0)]
     (left, top), (right, bottom) = (
         [of(edges) for edges in zip(*(box[part] for box in shown), strict=True)]
@@ -62,10 +59,10 @@ def occlusion_map(
     # One entry at least, for whoever looks up nothing.
     covering = numbers.new_full((max(1, num_frames * height * width), 2), torch.inf)
     images = covering[: num_frames * height * width].view(num_frames, height, width, 2)
-    instances = zip(numbers.tolist(), frames, boxes, _masks(detections, side), strict=True)
+    instances = zip(numbers.tolist(), frames, boxes, crops, strict=True)
     # Painted from behind, so that the foremost stays; an instance has a number of one kind, or none.
-    for of_kinds, at, (u0, v0, u1, v1), mask in sorted(instances, key=lambda instance: instance[0], reverse=True):
-        covers = mask[v0:v1, u0:u1] > MASK_THRESHOLD
+    for of_kinds, at, (u0, v0, u1, v1), crop in sorted(instances, key=lambda instance: instance[0], reverse=True):
+        covers = crop > MASK_THRESHOLD
         for kind, number in enumerate(of_kinds):
             if number < math.inf:
                 images[at, v0 - top : v1 - top, u0 - left : u1 - left, kind].masked_fill_(covers, number)
@@ -97,7 +94,9 @@ def _instances(detections: Detections, order: str) -> tuple[Tensor, Tensor, Tens
     return frame, numbers, limits
 
 
-def _masks(detections: Detections, side: Side) -> list[Tensor]:
-    """Masks (H, W) of all instances."""
-    sources = [detections] if detections.occluders is None else [detections, detections.occluders]
-    return [mask for source in sources for mask in getattr(source, f"mask_{side}").detach()]
+def _masks(detections: Detections, side: Side) -> MaskCrops:
+    """The masks of all instances."""
+    own, others = (detections.mask_left, detections.mask_right)[side == "right"], detections.occluders
+    if others is None:
+        return own.detach()
+    return MaskCrops.joined([own, (others.mask_left, others.mask_right)[side == "right"]]).detach()

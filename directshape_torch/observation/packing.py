@@ -15,10 +15,12 @@ from torch import Tensor
 from directshape_torch.config import SamplingConfig, SamplingMode
 from directshape_torch.geometry.projection import rays_from_pixels, right_rays
 from directshape_torch.image.grey_levels import gradient_magnitude_at, gradient_magnitude_of_part
-from directshape_torch.observation.extents import SceneExtents, region_boxes, scene_extents
 from directshape_torch.observation.occlusion import occlusion_map
 from directshape_torch.rows import OcclusionMap, PixelSamples, PointSamples
 from directshape_torch.scene import SIDES, Detections, FrameBatch, Side
+
+# How far a region reaches beyond mask and box, on every side.
+_MARGIN_PX, _MARGIN_SHARE = 4.0, 0.1
 
 
 @dataclass(frozen=True)
@@ -38,23 +40,20 @@ class Observation:
         return replace(self, left=self.left.of_objects(keep), right=self.right.of_objects(keep), points=points)
 
 
-def pack_pixels(
-    frames: FrameBatch, detections: Detections, config: SamplingConfig, extents: SceneExtents | None = None
-) -> Observation:
+def pack_pixels(frames: FrameBatch, detections: Detections, config: SamplingConfig) -> Observation:
     """Choose the pixels of every car in both images and gather what the residuals need of them.
 
     The initial poses fix regions and the correspondence for the disparity field.
     """
-    extents = scene_extents(detections) if extents is None else extents
-    regions = car_regions(frames, detections, extents)
+    regions = car_regions(frames, detections)
     hidden_left, hidden_right = (
-        occlusion_map(detections, side, config.occlusion_order, extents) if config.occlusion else None for side in SIDES
+        occlusion_map(detections, side, config.occlusion_order) if config.occlusion else None for side in SIDES
     )
     return Observation(
         _pack_side(frames, detections, "left", regions[0], hidden_left, config),
         _pack_side(frames, detections, "right", regions[1], hidden_right, config),
         hidden_right,
-        extents.areas,
+        torch.stack([detections.mask_left.areas, detections.mask_right.areas], dim=1),
     )
 
 
@@ -67,14 +66,42 @@ def residual_offsets(frames: FrameBatch, uv_left: Tensor) -> tuple[Tensor, Tenso
     return field.offsets(uv_left)
 
 
-def car_regions(frames: FrameBatch, d: Detections, extents: SceneExtents | None = None) -> tuple[Tensor, Tensor]:
+def car_regions(frames: FrameBatch, d: Detections) -> tuple[Tensor, Tensor]:
     """Regions (B, 4) of the cars in the left and the right image, integer (u0, v0, u1, v1), half open."""
-    extents = scene_extents(d) if extents is None else extents
-    sizes, count = frames.sizes[d.frame_index], len(d)
-    left = region_boxes(d.box_2d, extents.boxes_left[:count], sizes)
+    sizes = frames.sizes[d.frame_index]
+    left = region_boxes(d.box_2d, d.mask_left.extents, sizes)
     # Only the left image has detection boxes. A side without a mask says nothing about the car: no pixels there.
-    right = region_boxes(torch.full_like(d.box_2d, torch.nan), extents.boxes_right[:count], sizes)
+    right = region_boxes(torch.full_like(d.box_2d, torch.nan), d.mask_right.extents, sizes)
     return left * d.has_mask_left[:, None], right
+
+
+def region_boxes(
+    boxes: Tensor,  # (B, 4)
+    mask_boxes: Tensor,  # (B, 4)
+    sizes: Tensor,  # (B, 2)
+) -> Tensor:
+    """The region (B, 4) on one side whose pixels can speak about each car: integer, half open, 0 where nothing is left.
+
+    The mask's box (all 0: none) joined with the given one (NaN, or outside of the image: none), grown on every side by
+    the larger of 4 px and a tenth of its width (or height) and clipped to the image, so that a shape that spills out of
+    its mask pays for it.
+    """
+    last_uv = (sizes.flip(-1) - 1).to(boxes.dtype)
+    in_mask = mask_boxes[:, 2] > mask_boxes[:, 0]
+    mask_box = torch.cat([mask_boxes[:, :2], mask_boxes[:, 2:] - 1], dim=1).to(boxes.dtype)
+    in_image = (boxes[:, 2:] >= 0).all(dim=1) & (boxes[:, :2] <= last_uv).all(dim=1)
+    box_counts = in_image & (boxes[:, 2:] >= boxes[:, :2]).all(dim=1)
+
+    far = torch.full_like(last_uv, torch.inf)
+    low, high = far, -far
+    for box, counts in ((mask_box, in_mask), (boxes, box_counts)):
+        low = torch.minimum(low, torch.where(counts[:, None], box[:, :2], far))
+        high = torch.maximum(high, torch.where(counts[:, None], box[:, 2:], -far))
+    low, high = low.clamp(min=0).minimum(last_uv), high.clamp(min=0).minimum(last_uv)
+    margin = (_MARGIN_SHARE * (high - low)).clamp(min=_MARGIN_PX)
+    first = (low - margin).floor().clamp(min=0)
+    end = (high + margin).ceil().minimum(last_uv) + 1
+    return torch.cat([first, end], dim=1).long() * (in_mask | box_counts)[:, None]
 
 
 def _pack_side(
@@ -101,7 +128,7 @@ def _pack_side(
         uv=uv_float,
         origin_cam=origin,
         ray_cam=ray,
-        foreground=mask[object_index, uv[:, 1], uv[:, 0]].to(uv_float.dtype),
+        foreground=mask.at(object_index, *uv.unbind(1)).to(uv_float.dtype),
         gradient_magnitude=gradient_magnitude_at(images, frames.sizes, detections.frame_index[object_index], uv),
         bias_px=bias,
         vertical_px=vertical,

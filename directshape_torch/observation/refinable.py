@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from copy import copy
 
 import torch
 from torch import Tensor
@@ -14,7 +13,6 @@ from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import FOLLOWING
 from directshape_torch.numerics.gradient_mode import is_forward_mode
 from directshape_torch.numerics.tensors import occurrences
-from directshape_torch.observation.extents import SceneExtents, scene_extents
 from directshape_torch.observation.packing import Observation
 from directshape_torch.scene import Detections, FrameBatch, Occluders
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -79,12 +77,10 @@ def _check_masks(name: str, instances: Detections | Occluders, frames: FrameBatc
     """Raise `InputError` unless masks are those of frames of the call."""
     if not len(instances.frame_index):
         return
-    if instances.mask_left.shape[1:] != frames.images_left.shape[2:]:
-        raise InputError(
-            f"{name}.mask_left",
-            f"masks of the (padded) image size {tuple(frames.images_left.shape[2:])}",
-            f"{tuple(instances.mask_left.shape[1:])}",
-        )
+    size_hw = tuple(frames.images_left.shape[2:])
+    for side, masks in (("mask_left", instances.mask_left), ("mask_right", instances.mask_right)):
+        if masks.size_hw != size_hw:
+            raise InputError(f"{name}.{side}", f"masks of the (padded) image size {size_hw}", f"{masks.size_hw}")
     lowest, highest = torch.stack(torch.aminmax(instances.frame_index)).tolist()
     if lowest < 0 or highest >= len(frames):
         raise InputError(f"{name}.frame_index", f"0..{len(frames) - 1}", f"{lowest}..{highest}")
@@ -101,17 +97,6 @@ def _check_times(detections: Detections, frames: FrameBatch) -> None:
             cure = "take the time of the first frame off before they become float32, or leave times out"
             raise InputError("frames.time_s", "another time for each view of a track", f"{view[1]:g} s twice", cure)
         seen.add(view)
-
-
-def without_empty_masks(detections: Detections, extents: SceneExtents | None = None) -> Detections:
-    """A mask without any foreground counts as none: it would only say that there is no car."""
-    areas = (scene_extents(detections) if extents is None else extents).areas
-    left, right = (areas > 0).unbind(dim=1)
-    # A copy and not `replace`, which would check all over again what is not touched.
-    same = copy(detections)
-    object.__setattr__(same, "has_mask_left", left)
-    object.__setattr__(same, "has_mask_right", right)
-    return same
 
 
 def refusals(frames: FrameBatch, detections: Detections, seen: Observation, config: RefinerConfig) -> Tensor:
@@ -136,4 +121,5 @@ def _lacking_pixels(pixels: Observation, least: int) -> list[tuple[Tensor, Statu
     left, right = (occurrences(x.object_index, len(areas)) for x in (pixels.left, pixels.right))
     # A region always has pixels, but masks that show next to nothing cannot tell a car from its surroundings.
     too_few = torch.minimum(left + right, areas.sum(dim=1)) < least
-    return [(too_few, Status.too_few_pixels), (~(areas > 0).any(dim=1), Status.no_mask)]
+    # The texture is compared from the left image to the right one: without a left mask nothing holds a car's depth.
+    return [(too_few, Status.too_few_pixels), (areas[:, 0] == 0, Status.no_mask)]

@@ -100,10 +100,8 @@ def _is_cut_off(stereo: Photometric) -> Tensor:
     left, cars = stereo.left, stereo.cars
     assert left is not None
     height, width = left.pyramid[0].sizes[cars.frame_index].unbind(1)
-    row, steps = cars.detection_row[:, None], torch.arange(_BORDER_PX, device=height.device)
-    at_left, at_right = (left.mask_left[row, :, x] for x in (steps.expand(len(row), -1), width[:, None] - 1 - steps))
-    below = left.mask_left[row, height[:, None] - 1 - steps]
-    return (torch.cat([x.flatten(1) for x in (at_left, at_right, below)], dim=1) > 0.5).any(dim=1)
+    u0, _, u1, v1 = left.mask_left.extents[cars.detection_row].unbind(1)
+    return (u1 > u0) & ((u0 < _BORDER_PX) | (u1 > width - _BORDER_PX) | (v1 > height - _BORDER_PX))
 
 
 def parts_by_shape(cars: CarBatch, says: SaidOfShape, joins: Tensor) -> list[list[list[int]]]:

@@ -267,15 +267,16 @@ class RefinementResult(CarRecord):
         if frame not in ("ref", "cam"):
             raise InputError("frame", "'cam' or 'ref'", repr(frame))
         T = self.T_ref_obj if frame == "ref" else self.T_cam_obj
-        extents = zero_level_extents(self.prior.values(self.code), self.prior.origin, self.prior.spacing_m)
-        lower, upper = extents.unbind(1)
+        # A car whose shape was not refined keeps the detector's box, not one of the mean shape.
+        rows = (self.refined & self.has_shape).nonzero()[:, 0]
+        values = self.prior.values(self.code[rows])
+        lower, upper = zero_level_extents(values, self.prior.origin, self.prior.spacing_m).unbind(1)
         length, height, width = (upper - lower).unbind(-1)
         middle = 0.5 * (lower + upper)
         bottom_obj = torch.stack([middle[:, 0], upper[:, 1], middle[:, 2]], dim=-1)
-        # A car whose shape was not refined keeps the detector's box, not one of the mean shape.
-        refined = self.refined[:, None] & self.has_shape
-        dimensions = torch.where(refined, torch.stack([height, width, length], dim=-1), self.input_dimensions_hwl)
-        location = torch.where(refined, se3.transform(T, bottom_obj), T[:, :3, 3])
+        hwl = torch.stack([height, width, length], dim=-1)
+        dimensions = self.input_dimensions_hwl.index_copy(0, rows, hwl)
+        location = T[:, :3, 3].index_copy(0, rows, se3.transform(T[rows], bottom_obj))
         return se3.from_rotation_translation(T[:, :3, :3], location), dimensions
 
     @property

@@ -102,14 +102,15 @@ def observe_detections(frames: FrameBatch, detections: Detections) -> Tensor:  #
 
 def _rows_of_frame(frames: FrameBatch, detections: Detections, frame: int) -> list[Tensor]:
     depth = detections.T_cam_obj[:, 2, 3]
-    ahead = (detections.frame_index == frame) & (depth > _NEAREST_M) & (depth < _FARTHEST_M)
-    if not bool(ahead.any()):
+    is_ahead = ((depth > _NEAREST_M) & (depth < _FARTHEST_M)).tolist()
+    ahead = [car for car in detections.telling_rows(frame) if is_ahead[car]]
+    if not ahead:
         return []
     rig = Rig.of_frame(frames, frame)
     width, height = rig.size_wh
     images = (side[frame, :, :height, :width] for side in (frames.images_left, frames.images_right))
     pair = MatchedPair.of(*(rgb8(image) for image in images))
-    rows = (_row_of_car(detections, car, pair, rig) for car in ahead.nonzero()[:, 0].tolist())
+    rows = (_row_of_car(detections, car, pair, rig) for car in ahead)
     return [row for row in rows if row is not None]
 
 
@@ -137,7 +138,7 @@ def _pixels_of_car(detections: Detections, car: int, T_cam_obj: Tensor, hwl: Ten
     """(H, W) the car's mask; without a mask the pixels round its box."""
     width, height = rig.size_wh
     if bool(detections.has_mask_left[car]):
-        return detections.mask_left[car, :height, :width].detach().cpu() > 0.5
+        return detections.mask_left[car][:height, :width].detach().cpu() > 0.5
     corners = project(box_corners(T_cam_obj, hwl), rig.K_left)
     limit = torch.tensor([width, height]).double()
     low, high = corners.amin(dim=0).maximum(0 * limit).long(), corners.amax(dim=0).minimum(limit).ceil().long()

@@ -12,7 +12,7 @@ from torch import Tensor
 from directshape_torch.geometry.box3d import rotation_y_from_pose
 from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.scene import SIDES, Detections, FrameBatch, Side, boxes_around
+from directshape_torch.scene import SIDES, Detections, FrameBatch, Side
 from directshape_torch.stereo_matching.disparity import rgb8
 
 Floats = NDArray[np.float64]
@@ -54,23 +54,26 @@ class FrameEvidence:
 
 def evidence_of_scene(frames: FrameBatch, detections: Detections) -> list[FrameEvidence]:
     """The evidence of every frame; cars with numbers that are not finite, or without 2D box and mask, are left out."""
-    frame_index = detections.frame_index.cpu().numpy()
     usable = (_array(detections.T_cam_obj).reshape(-1, 16), _array(detections.dimensions_hwl))
     known = np.logical_and.reduce([np.isfinite(part).all(axis=1) for part in usable])
     known &= np.isfinite(_array(detections.box_2d)).all(axis=1) | detections.has_mask_left.cpu().numpy()
     sizes = frames.sizes.cpu().tolist()
     return [
-        _frame_evidence(frames, detections, number, np.flatnonzero(known & (frame_index == number)), (height, width))
+        _frame_evidence(frames, detections, number, _known_rows(detections, number, known), (height, width))
         for number, (height, width) in enumerate(sizes)
     ]
+
+
+def _known_rows(detections: Detections, number: int, known: NDArray[np.bool_]) -> NDArray[np.int64]:
+    return np.array([row for row in detections.telling_rows(number) if known[row]], dtype=np.int64)
 
 
 def _frame_evidence(
     frames: FrameBatch, d: Detections, number: int, rows: NDArray[np.int64], size_hw: tuple[int, int]
 ) -> FrameEvidence:
     chosen = torch.from_numpy(rows).to(d.T_cam_obj.device)
-    masks = {side: _masks_of(d, side, chosen, size_hw) for side in SIDES}
-    around = {side: boxes_around(masks[side]).double().cpu().numpy() for side in SIDES}
+    masks = {side: (d.mask_left if side == "left" else d.mask_right).rows(chosen).detach() for side in SIDES}
+    around = {side: np.asarray(masks[side].box_2d.cpu().numpy()) for side in SIDES}
     has = {side: np.isfinite(around[side]).all(axis=1) for side in SIDES}
     T = d.T_cam_obj.index_select(0, chosen)
     boxes = CarBoxes(
@@ -80,15 +83,18 @@ def _frame_evidence(
         np.full(len(rows), np.nan),
         _array(d.box_2d.index_select(0, chosen)),
     )
-    left = list(zip(around["left"], masks["left"].cpu().numpy(), has["left"], strict=True))
+    left = list(zip(around["left"], has["left"], strict=True))
     return FrameEvidence(
         frame_id=frames.frame_ids[number],
         boxes=boxes,
         mask_boxes=around,
         overlap={side: box_iou(boxes.box_2d, around[side]).diagonal() for side in SIDES},
         num_masks={side: int(has[side].sum()) for side in SIDES},
-        seen=tuple(box[None][: int(known)] for box, _, known in left),
-        masks=tuple(mask if known else None for _, mask, known in left),
+        seen=tuple(box[None][: int(known)] for box, known in left),
+        masks=tuple(
+            (masks["left"][row] > 0.5).cpu().numpy()[: size_hw[0], : size_hw[1]] if known else None
+            for row, known in enumerate(has["left"])
+        ),
         camera=_camera_of(frames.camera, number),
         size_hw=size_hw,
         has_masks=True,
@@ -107,18 +113,6 @@ def _camera_of(camera: StereoCamera, number: int) -> StereoCamera:
     parts = {name: getattr(camera, name)[number : number + 1] for name in ("K_left", "K_right", "T_right_cam")}
     one = replace(camera, **parts, t_cam_ref=torch.zeros_like(camera.t_cam_ref[:1]))
     return one.to("cpu", torch.float64)
-
-
-def _masks_of(d: Detections, side: str, rows: Tensor, size_hw: tuple[int, int]) -> Tensor:
-    """(N, H, W) bool."""
-    masks: Tensor = getattr(d, f"mask_{side}")
-    height, width = size_hw
-    if masks.shape[1] < height or masks.shape[2] < width:
-        return torch.zeros((len(rows), height, width), dtype=torch.bool)
-    masks = masks.index_select(0, rows)[:, :height, :width].detach()
-    present = getattr(d, f"has_mask_{side}").index_select(0, rows)
-    inside = masks if masks.dtype == torch.bool else masks > 0.5
-    return torch.logical_and(inside, present[:, None, None])
 
 
 def _array(tensor: Tensor) -> Floats:

@@ -100,7 +100,7 @@ def _once(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def _mask_sizes(frames: FrameBatch, detections: Detections) -> list[Finding]:
-    images, masks = tuple(frames.images_left.shape[2:]), tuple(detections.mask_left.shape[1:])
+    images, masks = tuple(frames.images_left.shape[2:]), detections.mask_left.size_hw
     if not len(detections) or images == masks:
         return []
     measured = f"masks of {masks[1]} x {masks[0]}, images of {images[1]} x {images[0]} pixels"

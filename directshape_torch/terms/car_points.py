@@ -8,9 +8,10 @@ from torch import Tensor
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.projection import points_from_disparity
+from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.rows import PointSamples
-from directshape_torch.scene import MASK_THRESHOLD, Detections, FrameBatch
+from directshape_torch.scene import Detections, FrameBatch
 
 # Above the ground plane: lower points are road, higher ones trees.
 _HEIGHTS_M = (0.1, 3.0)
@@ -35,8 +36,9 @@ def car_points(frames: FrameBatch, detections: Detections, config: PointCloudCon
     disparity = frames.disparity
     if disparity is None:
         raise InputError("frames.disparity", "a disparity map of each frame", "None", "use with_disparity")
-    pixels = _pixels(frames, detections)
-    object_index, v, u = (pixels & _known(disparity)[detections.frame_index]).nonzero(as_tuple=True)
+    object_index, v, u = _pixels(frames, detections)
+    known = _known(disparity[detections.frame_index[object_index], v, u]).nonzero()[:, 0]
+    object_index, v, u = object_index[known], v[known], u[known]
     frame = detections.frame_index[object_index]
     camera = frames.camera
     points_cam = points_from_disparity(
@@ -55,21 +57,27 @@ def car_points(frames: FrameBatch, detections: Detections, config: PointCloudCon
     return PointSamples(object_index[kept], points_cam[kept], counts)
 
 
-def _pixels(frames: FrameBatch, d: Detections) -> Tensor:
-    """Left pixels (B, H, W) of each car: of its mask where it has one, else of its 2D box."""
-    height, width = frames.images_left.shape[2:]
-    u, v = (torch.arange(n, device=d.box_2d.device) for n in (width, height))
-    u_min, v_min, u_max, v_max = d.box_2d[:, :, None].unbind(1)
-    rows, columns = frames.sizes[d.frame_index, :, None].unbind(1)
-    in_box = _grid((v >= v_min) & (v <= v_max), (u >= u_min) & (u <= u_max))
-    chosen = torch.where(d.has_mask_left[:, None, None], d.mask_left > MASK_THRESHOLD, in_box)
-    # Whatever the padding of a smaller frame holds is no part of it.
-    return chosen & _grid(v < rows, u < columns)
-
-
-def _grid(of_row: Tensor, of_column: Tensor) -> Tensor:
-    """Pixels (B, H, W) whose row (B, H) and column (B, W) both hold."""
-    return of_row[:, :, None] & of_column[:, None, :]
+def _pixels(frames: FrameBatch, d: Detections) -> tuple[Tensor, Tensor, Tensor]:
+    """The left pixels of each car, of its mask where it has one, else of its 2D box: car, row and column (P,) each."""
+    parts = []
+    boxes, sizes = d.box_2d.detach().double().cpu(), frames.sizes[d.frame_index].tolist()
+    corners = torch.cat([boxes[:, :2].ceil(), boxes[:, 2:].floor() + 1], dim=1).nan_to_num(0.0)
+    has_mask, crops = d.has_mask_left.tolist(), d.mask_left.boxes.tolist()
+    for car, (height, width) in enumerate(sizes):
+        # Whatever the padding of a smaller frame holds is no part of it.
+        limit = torch.tensor([width, height, width, height], dtype=torch.float64)
+        u0, v0, u1, v1 = corners[car].clamp(min=0).minimum(limit).long().tolist()
+        if has_mask[car]:
+            u0, v0 = crops[car][:2]
+            v, u = (
+                (d.mask_left.crop(car) > MASK_THRESHOLD)[: max(0, height - v0), : max(0, width - u0)]
+                .nonzero()
+                .unbind(1)
+            )
+        else:
+            v, u = d.frame_index.new_ones(max(0, v1 - v0), max(0, u1 - u0)).nonzero().unbind(1)
+        parts.append(torch.stack([torch.full_like(v, car), v + v0, u + u0]))
+    return tuple(torch.cat(parts, dim=1)) if parts else (d.frame_index[:0],) * 3
 
 
 def _known(disparity: Tensor) -> Tensor:

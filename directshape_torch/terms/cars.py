@@ -117,7 +117,6 @@ class CarBatch(Record):
     offset_sigma_px: Tensor | None
     field_sigma_px: Tensor  # (B,) that of the rig's disparity field at the car; 0 where the offset is an unknown
     track_id: Tensor | None  # (B,) see `Detections`, or None
-    has_mask_left: Tensor  # (B,) bool
     time_s: Tensor | None = None  # (B,) of each car's frame, see `FrameBatch`, or None
     T_world_cam: Tensor | None = None  # (B, 4, 4) likewise
 
@@ -150,7 +149,6 @@ class CarBatch(Record):
             offset_sigma_px=offset_sigma_px,
             field_sigma_px=field_sigma_px,
             track_id=detections.track_id,
-            has_mask_left=detections.has_mask_left,
             time_s=None if frames.time_s is None else frames.time_s[f],
             T_world_cam=None if frames.T_world_cam is None else frames.T_world_cam[f],
         )

@@ -10,9 +10,10 @@ from torch import Tensor
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.projection import project
+from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.rows import PointSamples
-from directshape_torch.scene import MASK_THRESHOLD, Detections, FrameBatch
+from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.car_points import every_nth, stands_at
 from directshape_torch.terms.cars import CarBatch
@@ -85,7 +86,7 @@ def _in_mask(frames: FrameBatch, detections: Detections, rows: Tensor, points_ca
     column, row = uv.nan_to_num(-1.0).round().clamp(-1, max(frames.images_left.shape[2:])).long().unbind(-1)
     seen = (points_cam[..., 2] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     column, row = (torch.where(seen, x, torch.zeros_like(x)) for x in (column, row))
-    masked = detections.mask_left[rows[:, None], row, column] > MASK_THRESHOLD
+    masked = detections.mask_left.at(rows[:, None], column, row) > MASK_THRESHOLD
     u_min, v_min, u_max, v_max = detections.box_2d[rows, :, None].unbind(1)
     u, v = uv.unbind(-1)
     in_box = (u >= u_min) & (u <= u_max) & (v >= v_min) & (v <= v_max)

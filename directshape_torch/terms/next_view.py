@@ -47,7 +47,7 @@ _MOST_SHIFT_PX, _CONTRAST_FLOOR = 3, 5.0
 class NextViews(NamedTuple):
     """The next view of each of B views."""
 
-    exists: Tensor  # (B,) bool, and has a left mask: not so of the last view of a track
+    exists: Tensor  # (B,) bool: not so of the last view of a track
     frame_index: Tensor  # (B,)
     detection_row: Tensor  # (B,)
     K_left: Tensor  # (B, 3, 3)
@@ -55,7 +55,7 @@ class NextViews(NamedTuple):
     @classmethod
     def of(cls, cars: CarBatch, next_view: Tensor) -> NextViews:
         """From the number (B,) of the next view; the last one of a track has its own."""
-        exists = (next_view != torch.arange(len(next_view), device=next_view.device)) & cars.has_mask_left[next_view]
+        exists = next_view != torch.arange(len(next_view), device=next_view.device)
         return cls(exists, *(x[next_view] for x in (cars.frame_index, cars.detection_row, cars.K_left)))
 
 

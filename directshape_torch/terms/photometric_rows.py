@@ -17,6 +17,7 @@ from torch import Tensor
 from directshape_torch.config import PhotometricConfig
 from directshape_torch.image.grey_levels import GreyPair
 from directshape_torch.image.interpolate import BilinearPatch, bilinear_patch
+from directshape_torch.masks import MASK_THRESHOLD, MaskCrops
 from directshape_torch.numerics.tensors import all_along, made_once
 from directshape_torch.rows import OcclusionMap, PixelSamples, Rays, Rows
 from directshape_torch.terms.cars import CarBatch
@@ -98,7 +99,7 @@ class LeftPixels:
     rays: Rays  # of these blocks
     pyramid: tuple[GreyPair, ...]  # both images at every level that a stage asks for
     hidden_right: OcclusionMap | None  # where nearer instances cover the right image; None: nowhere
-    mask_left: Tensor  # (detections of the call, H, W)
+    mask_left: MaskCrops  # of the detections of the call
 
     @classmethod
     def of(
@@ -107,7 +108,7 @@ class LeftPixels:
         packed: Rows,
         pyramid: Sequence[GreyPair],
         hidden_right: OcclusionMap | None,
-        mask_left: Tensor,
+        mask_left: MaskCrops,
     ) -> LeftPixels:
         """From pixels, and how they fill blocks."""
         rays = Rays.of_rows(packed, pixels.origin_cam, pixels.ray_cam)
@@ -193,11 +194,11 @@ class LeftPixels:
         return RightView(images.right.reshape(-1), view, to_full, *covered)
 
 
-def is_on_mask(mask_left: Tensor, row: Tensor, u: Tensor, v: Tensor) -> Tensor:
+def is_on_mask(mask_left: MaskCrops, row: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """Where points (..., M, 64) of left images are on the masks of the detections in rows (M,), or beside the image."""
-    height, width = mask_left.shape[-2:]
+    height, width = mask_left.size_hw
     at_u, at_v = (x.round().long().clamp(0, last - 1) for x, last in ((u, width), (v, height)))
-    return mask_left[row[:, None], at_v, at_u] > 0.5
+    return mask_left.at(row[:, None], at_u, at_v) > MASK_THRESHOLD
 
 
 def frame_view(images: GreyPair, frame: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

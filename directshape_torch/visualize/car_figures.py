@@ -16,7 +16,6 @@ from directshape_torch.config import SamplingMode
 from directshape_torch.errors import InputError
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observation.packing import pack_pixels, residual_offsets
-from directshape_torch.observation.refinable import without_empty_masks
 from directshape_torch.scene import SIDES, Side
 from directshape_torch.visualize.drawing import (
     BLUE,
@@ -151,7 +150,7 @@ class CarCourse:
 def sampled_pixels_of(car: CarCourse, side: Side) -> tuple[NDArray[np.int64], int]:
     """The pixels (P, 2) that the refinement used, and how many more a nearer instance hides."""
     trace, config = car.trace, replace(car.trace.config.sampling, occlusion=False)
-    unhidden = pack_pixels(car.loaded.frame, without_empty_masks(car.loaded.detections), config)
+    unhidden = pack_pixels(car.loaded.frame, car.loaded.detections, config)
     (used, place), (found, row) = (
         (seen.left if side == "left" else seen.right, number)
         for seen, number in ((trace.pixels, trace.place_of(car.row)), (unhidden, car.row))

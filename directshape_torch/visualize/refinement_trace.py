@@ -13,7 +13,6 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.observation.packing import Observation, pack_pixels
-from directshape_torch.observation.refinable import without_empty_masks
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
@@ -116,7 +115,7 @@ def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections
         costs.new_full((len(costs), len(detections), costs.shape[2]), torch.nan).index_copy(1, rows, costs),
         rows,
         minimum.stage,
-        pack_pixels(frames, without_empty_masks(detections), refiner.config.sampling).of_objects(took_part),
+        pack_pixels(frames, detections, refiner.config.sampling).of_objects(took_part),
     )
 
 

@@ -17,7 +17,6 @@ from directshape_torch.geometry import se3
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.observation.packing import Observation, pack_pixels
-from directshape_torch.observation.refinable import without_empty_masks
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -122,7 +121,7 @@ def residual_maps(
     with full_precision(frame.images_left.device.type):
         of_all, inputs = DirectShapeRefiner(prior, config).problem(frame, detections)
         problem, start = of_all.of_problems(chosen), CarState(*(x[rows] for x in inputs))
-        pixels = pack_pixels(frame, without_empty_masks(detections), sampling).of_objects(chosen)
+        pixels = pack_pixels(frame, detections, sampling).of_objects(chosen)
         for state in states:
             T_cam_obj, code = (torch.from_numpy(np.asarray(x)).to(start.code) for x in state)
             sight = problem.look(start._replace(T_obj_cam=se3.inverse(T_cam_obj), code=code))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.geometry.disparity_field import EXPONENTS, NUM_COEFFICIENTS, polynomial_basis
+from directshape_torch.masks import MaskCrops
 from directshape_torch.scene import Detections, FrameBatch
 
 
@@ -45,7 +46,7 @@ class Bend:
     def masks(self, detections: Detections) -> Detections:
         """Detections whose right masks follow the image."""
         masks = [torch.from_numpy(self.image(mask.numpy(), cv2.INTER_LINEAR)) for mask in detections.mask_right]
-        return replace(detections, mask_right=torch.stack(masks)) if masks else detections
+        return replace(detections, mask_right=MaskCrops.of(masks)) if masks else detections
 
     @cached_property
     def _maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

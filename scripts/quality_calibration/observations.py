@@ -140,8 +140,7 @@ def _drawn(dataset: StereoDataset, number: int, level: NoiseLevel, seed: int) ->
         bend = Bend.drawn(now.field_px, now.rows_px, (width, height), seed)
         loaded, drawn = replace(loaded, frame=bend.frames(loaded.frame)), bend.masks(drawn)
     if not now.has_right_masks:
-        nothing = torch.zeros_like(drawn.mask_right), torch.zeros_like(drawn.has_mask_right)
-        drawn = replace(drawn, mask_right=nothing[0], has_mask_right=nothing[1])
+        drawn = replace(drawn, mask_right=drawn.mask_right.where(torch.zeros_like(drawn.has_mask_right)))
     return loaded, drawn
 
 

@@ -47,7 +47,10 @@ def timings(forms: int = 0) -> RunTimings:
         ({"a": done()}, ["none of the 1 input lines is of class Car"]),
         ({"a": done(converged=1) | {"masks_right": 0}, "b": done(converged=1)}, []),
         ({"a": done(converged=1) | {"masks_right": 0}}, []),
-        ({"a": done(converged=1) | {"masks_left": 0}}, ["no car has a mask in the left image"]),
+        (
+            {"a": done(converged=1, no_mask=1) | {"no_mask": {"2": "its entry has no mask"}}},
+            ["1 of 2 cars have no mask in the left image: line 2 of a: its entry has no mask"],
+        ),
         ({"a": done(converged=1) | {"ground_source": "camera_height"}}, ["the ground of 1 of 1 frames"]),
     ],
 )

@@ -342,7 +342,7 @@ def test_25_letters() -> None:
     _, at = stage.start(sight)
     assert (at.cost.shape, at.gradient.shape, at.hessian.shape) == ((B,), (B, D), (B, D, D))
     assert scene.frames.images_left.shape == (F, 3, H, W)
-    assert scene.detections.mask_left.shape == (B, H, W)
+    assert scene.detections.mask_left.dense().shape == (B, H, W)
 
 
 def test_26_systems_are_float64() -> None:

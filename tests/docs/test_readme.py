@@ -25,8 +25,8 @@ def tensors_of_the_bundled_frame() -> dict[str, object]:
         "images_left": frame.images_left,
         "images_right": frame.images_right,
         "boxes_3d": poses_to_boxes(found.T_cam_obj, found.dimensions_hwl, "kitti"),
-        "masks_left": found.mask_left,
-        "masks_right": found.mask_right,
+        "masks_left": found.mask_left.dense(),
+        "masks_right": found.mask_right.dense(),
         "frame_index": found.frame_index,
     }
 

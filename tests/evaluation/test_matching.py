@@ -8,10 +8,10 @@ from directshape_torch.io.kitti_labels import KittiObject, parse_object
 
 
 def _object(
-    box: tuple[float, float, float, float], kind: str = "Car", truncated: float = 0, occluded: int = 0
+    box: tuple[float, float, float, float], kind: str = "Car", truncated: float = 0, occluded: int = 0, x: float = 1
 ) -> KittiObject:
     u_min, v_min, u_max, v_max = box
-    place = "-1000 -1000 -1000 -10" if kind == "DontCare" else "1 1.6 20 0"
+    place = "-1000 -1000 -1000 -10" if kind == "DontCare" else f"{x} 1.6 20 0"
     text = f"{kind} {truncated} {occluded} 0 {u_min} {v_min} {u_max} {v_max} 1.5 1.6 3.9 {place}"
     return parse_object("labels", Line(1, text, text))
 
@@ -20,6 +20,16 @@ def test_the_better_detection_takes_the_label():
     labels = [_object((100, 100, 200, 200))]
     detections = [_object((110, 100, 210, 200)), _object((101, 100, 201, 200)), _object((300, 100, 400, 200))]
     assert match_to_labels(detections, labels) == {1: labels[0]}
+
+
+@pytest.mark.parametrize("box", [(-1, -1, -1, -1), (0, 0, 0, 0), (0, 0, 50, 50)])
+def test_a_detection_without_a_2d_box_takes_the_nearest_label(box):
+    """What LiDAR detectors write: 1 and 2 m from the second label, 5 m from either."""
+    labels = [_object((100, 100, 200, 200), x=0.0), _object((300, 100, 400, 200), x=8.0)]
+    near, nearer, far = (_object(box, x=x) for x in (6.0, 9.0, 13.0))
+    assert match_to_labels([near, nearer, far], labels) == {1: labels[1]}
+    with_box = _object((300, 100, 400, 200), x=20.0)
+    assert match_to_labels([nearer, with_box], labels) == {1: labels[1]}
 
 
 def test_each_detection_takes_its_largest_free_overlap():

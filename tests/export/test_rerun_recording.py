@@ -131,8 +131,8 @@ def test_images_are_those_of_the_data_set(
 def test_masks_have_the_numbers_of_lines(finished: FinishedRun, recording: Recording) -> None:
     loaded = finished.inputs().dataset.load("000000")  # type: ignore[union-attr]
     for entity, masks in (
-        ("/world/cam/image/masks", loaded.detections.mask_left),
-        ("/right/image/masks", loaded.detections.mask_right),
+        ("/world/cam/image/masks", loaded.detections.mask_left.dense()),
+        ("/right/image/masks", loaded.detections.mask_right.dense()),
     ):
         content = np.array(recording.at(entity, "buffer", 0)[0], dtype=np.uint8).view("<u2").reshape(120, 160)
         assert recording.at(entity, "format", 0)[0]["width"] == 160

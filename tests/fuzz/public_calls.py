@@ -166,7 +166,7 @@ def calls() -> dict[str, Call]:
             {"K": camera.K_left, "baseline_m": 0.5, "K_right": camera.K_right},
             lambda a: [StereoCamera.from_intrinsics(**a).T_right_cam],
         ),
-        "boxes": Call(_boxes(detections) | {"mask_left": list(detections.mask_left)}, _from_boxes),
+        "boxes": Call(_boxes(detections) | {"mask_left": list(detections.mask_left.dense())}, _from_boxes),
         "boxes of a LiDAR": Call(
             _boxes(detections) | {"convention": "nuscenes", "T_cam_boxes": torch.eye(4).double()}, _from_boxes
         ),
@@ -188,7 +188,8 @@ def calls() -> dict[str, Call]:
 def whole_call() -> tuple[FrameBatch, Detections]:
     """A call with every tensor that one can have."""
     _, street = cached_street()
-    masks = torch.zeros_like(street.detections.mask_left[:1])
+    masks = torch.zeros_like(street.detections.mask_left.dense()[:1])
+    masks[0, 0, 0] = 1.0
     one = masks.new_ones(1)
     frames = replace(
         street.frames,
@@ -223,7 +224,7 @@ def _loaded(a: Arguments) -> RefinementResult:
 
 def _gradient(a: Arguments) -> list[Tensor]:
     """By the images, the masks and the input poses, of what was accepted."""
-    wanted = [a["frames"].images_left, a["detections"].mask_left, a["detections"].T_cam_obj]
+    wanted = [a["frames"].images_left, a["detections"].mask_left.dense(), a["detections"].T_cam_obj]
     leaves = [x.detach().clone().requires_grad_() if x.is_floating_point() else x for x in wanted]
     frames = replace(a["frames"], images_left=leaves[0])
     detections = replace(a["detections"], mask_left=leaves[1], T_cam_obj=leaves[2])
@@ -287,8 +288,9 @@ def _boxes(detections: Detections) -> dict[str, Any]:
     """Every argument of `Detections.from_boxes`."""
     zeros = torch.zeros(2).double()
     boxes = torch.stack([zeros, zeros + 1, zeros + 20, zeros + 1.5, zeros + 1.6, zeros + 4, zeros + 0.3], dim=1)
-    names = ("mask_left", "mask_right", "has_mask_left", "has_mask_right", "frame_index", "score", "box_2d")
-    given = {name: getattr(detections, name) for name in (*names, "pose_sigma")}
+    names = ("has_mask_left", "has_mask_right", "frame_index", "score", "box_2d", "pose_sigma")
+    given = {name: getattr(detections, name) for name in names}
+    given |= {name: getattr(detections, name).dense() for name in ("mask_left", "mask_right")}
     return {"boxes": boxes, "convention": "kitti", "track_id": torch.tensor([-1, 3]), **given}
 
 

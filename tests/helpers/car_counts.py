@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 
-from torch import Tensor
+import torch
 
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import LoadedFrame
@@ -25,6 +25,4 @@ def with_cars(frames: Sequence[LoadedFrame], num_cars: int) -> tuple[FrameBatch,
 
 def first_cars(loaded: LoadedFrame, count: int) -> LoadedFrame:
     """A frame of which only the first cars are refined; the others are not there, so that they hide nothing either."""
-    given = {each.name: getattr(loaded.detections, each.name) for each in fields(Detections)}
-    kept = {name: value[:count] for name, value in given.items() if isinstance(value, Tensor)}
-    return replace(loaded, detections=replace(loaded.detections, **kept))
+    return replace(loaded, detections=loaded.detections.rows(torch.arange(count)))

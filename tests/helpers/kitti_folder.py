@@ -70,7 +70,7 @@ def _masks(detections: Detections) -> list[dict[str, object]]:
 
     entries: list[dict[str, object]] = []
     for side, masks in (("left", detections.mask_left), ("right", detections.mask_right)):
-        for number, mask in enumerate(masks.numpy()):
+        for number, mask in enumerate(masks.dense().numpy()):
             rle = coco.encode(np.asfortranarray(mask > 0.5, dtype=np.uint8))
             segmentation = {"size": list(rle["size"]), "counts": rle["counts"].decode()}
             entries.append({"image": side, "instance_id": number, "category_id": 3, "segmentation": segmentation})

@@ -13,9 +13,9 @@ def instances(dataset: StereoDataset, loaded: LoadedFrame) -> tuple[list[int], l
     masks = [] if dataset.masks is None else dataset.masks.read(loaded.frame_id, (height, width))
 
     def number(side: str, probability: np.ndarray) -> int:
-        same = (m for m in masks if m.side == side and np.array_equal(m.probability, probability))
+        same = (m for m in masks if m.side == side and np.array_equal(m.whole((height, width)), probability > 0.5))
         return next((mask.instance_id for mask in same), -1)
 
     found = loaded.detections
-    left, right = found.mask_left.float().numpy(), found.mask_right.float().numpy()
+    left, right = found.mask_left.dense().float().numpy(), found.mask_right.dense().float().numpy()
     return [number("left", mask) for mask in left], [number("right", mask) for mask in right]

@@ -44,7 +44,7 @@ class StreetInputs:
             return torch.randn(like.shape, generator=generator, dtype=like.dtype)
 
         # Clamped mask probabilities have no gradient.
-        self.mask = self.detections.mask_left.clamp(0.2, 0.8)
+        self.mask = self.detections.mask_left.dense().clamp(0.2, 0.8)
         self.mask_direction = 0.1 * noise(self.mask)
         self.image_direction = 0.02 * noise(self.scene.frames.images_right)
         self.basis_direction = 0.05 * self.prior.basis.flip(-1)

@@ -114,8 +114,6 @@ def street(
         score=torch.ones(count, dtype=dtype),
         mask_left=masks[0],
         mask_right=masks[1],
-        has_mask_left=masks[0].flatten(1).any(1),
-        has_mask_right=masks[1].flatten(1).any(1),
     )
     rig = camera.K_left[0], camera.K_right[0], camera.T_right_cam[0]
     disparity = disparity_of_depth(uv, depths[0], *rig)[:, 0].view(1, height, width)
@@ -140,6 +138,16 @@ def disturbed(detections: Detections, metres: float = 0.15, radians: float = 0.0
     return replace(detections, T_cam_obj=detections.T_cam_obj @ se3.exp(noise))
 
 
+def masked(detections: Detections, left: Tensor | None = None, right: Tensor | None = None) -> Detections:
+    """The detections with masks only where a condition (B,) holds."""
+    masks_left, masks_right = detections.mask_left, detections.mask_right
+    return replace(
+        detections,
+        mask_left=masks_left if left is None else masks_left.where(left),
+        mask_right=masks_right if right is None else masks_right.where(right),
+    )
+
+
 def select(detections: Detections, rows: Tensor) -> Detections:
     """Some of the detections, in the given order."""
     return select_detections(detections, rows)
@@ -161,8 +169,7 @@ def joined_detections(parts: list[Detections], size_hw: tuple[int, int]) -> Dete
     """Detections of consecutive single-frame batches, numbered by frame, masks padded to one size."""
 
     def padded(number: int, part: Detections) -> Detections:
-        room = (0, size_hw[1] - part.mask_left.shape[2], 0, size_hw[0] - part.mask_left.shape[1])
-        masks = {name: torch.nn.functional.pad(getattr(part, name), room) for name in ("mask_left", "mask_right")}
+        masks = {name: getattr(part, name).padded(size_hw) for name in ("mask_left", "mask_right")}
         return replace(part, frame_index=torch.full_like(part.frame_index, number), **masks)
 
     return Detections.joined([padded(number, part) for number, part in enumerate(parts)])

@@ -96,7 +96,7 @@ def write(_: Path, out: Path) -> None:
 
 def gradient(_: Path, __: Path) -> None:
     prior, street = cached_street()
-    masks = street.detections.mask_left.double().clone().requires_grad_()
+    masks = street.detections.mask_left.dense().double().clone().requires_grad_()
     config = load_config("fast", ["backward.mode=unroll", "acceptance.min_probability_better=0"])
     result = DirectShapeRefiner(prior, config)(street.frames, replace(street.detections, mask_left=masks))
     result.T_cam_obj.sum().backward()

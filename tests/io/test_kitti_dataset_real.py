@@ -46,8 +46,8 @@ def test_kitti_frames_with_simulated_stereo_detections() -> None:
 
 
 @pytest.mark.parametrize(("detections", "masks", "num_left", "num_both"), [
-    ("gt", "training/masks", 117, 116),
-    ("stereo", "masks_degraded", 99, 96),
+    ("gt", "training/masks", 119, 119),
+    ("stereo", "masks_degraded", 104, 102),
 ])  # fmt: skip
 def test_rendered_frames(detections: str, masks: str, num_left: int, num_both: int) -> None:
     dataset, loaded = load_all("rendered", detections, masks)

@@ -85,17 +85,17 @@ def test_bad_segmentations(segmentation: Any, message: str) -> None:
 @pytest.mark.parametrize("folder", ["", "data"])
 def test_frame_json(tmp_path: Path, folder: str) -> None:
     entries = [
-        entry(image="left", instance_id=7, bbox=[3, 1, 4, 3]),
+        entry(image="left", instance_id=7, bbox=[3, 1, 4, 3], score=0.25),
         entry(image="right", category_id=1),
     ]
     write_json(tmp_path / folder / "000004.json", entries)
     left, right = mask_source(tmp_path).read("000004", SIZE_HW)
     assert (left.side, left.instance_id, left.is_car) == ("left", 7, True)
-    # [x, y, w, h] covers columns 3..6 and rows 1..3; the mask itself columns 4..5.
-    assert left.box == (3, 1, 6, 3)
+    # The pixels count, columns 4..5, whatever the file's box says.
     assert left.mask_box == (4, 1, 5, 3)
-    assert (right.side, right.is_car, right.box) == ("right", False, (4, 1, 5, 3))
-    np.testing.assert_array_equal(right.probability, MASK)
+    assert (left.score, right.score) == (0.25, 1.0)
+    assert (right.side, right.is_car, right.mask_box) == ("right", False, (4, 1, 5, 3))
+    np.testing.assert_array_equal(right.whole(SIZE_HW), MASK)
 
 
 def test_soft_probability_replaces_the_binary_mask(tmp_path: Path) -> None:
@@ -106,7 +106,8 @@ def test_soft_probability_replaces_the_binary_mask(tmp_path: Path) -> None:
     source = FrameJsonMasks(tmp_path)
     (mask,) = source.read("000000", SIZE_HW)
     assert mask.probability.dtype == np.float32
-    np.testing.assert_allclose(mask.probability[2, 3:6], [0.2, 0.8, 1.0])
+    assert mask.crop_box == (3, 2, 6, 3)
+    np.testing.assert_allclose(mask.probability[0], [0.2, 0.8, 1.0])
     assert mask.mask_box == (4, 2, 5, 2)
     assert source.files("000000") == (tmp_path / "000000.json", tmp_path / "soft" / "a.png")
 
@@ -128,7 +129,7 @@ def test_empty_mask_is_no_instance(tmp_path: Path) -> None:
             [entry(image="left", segmentation=encoded(MASK))],
             r"000000\.json: entry 0: 'segmentation' is neither RLE nor",
         ),
-        ([entry(image="left", bbox=[1, 2])], "entry 0: bad or missing field"),
+        ([entry(image="left", score="high")], "entry 0: bad or missing field"),
         (
             [entry(image="left", segmentation={"size": [9, 6], "counts": RUNS})],
             r"000000\.json: entry 0: the mask has 6 x 9 pixels \(width x height\), its image 9 x 6",
@@ -171,7 +172,7 @@ def test_instance_png_of_mots_and_cityscapes(tmp_path: Path, car: int, other: in
     assert found[car].is_car
     assert not found[other].is_car
     assert found[car].mask_box == (4, 1, 5, 3)
-    np.testing.assert_array_equal(found[car].probability, MASK)
+    np.testing.assert_array_equal(found[car].whole(SIZE_HW), MASK)
     cars_of_another_class = InstancePngMasks(tmp_path, frozenset([other // 1000])).read("000000", SIZE_HW)
     assert [mask.instance_id for mask in cars_of_another_class if mask.is_car] == [other]
 

@@ -1,8 +1,9 @@
-"""One-to-one matching by geometry, in the left and through the camera in the right image."""
+"""One-to-one matching by pixels, in the left and through the camera in the right image."""
 
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,101 +11,188 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from directshape_torch.files.read_files import Line
 from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.geometry.image_boxes import box_iou, project_boxes
+from directshape_torch.geometry.image_boxes import project_boxes
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.frame_detections import match_masks, match_one_to_one, without_duplicates
-from directshape_torch.io.instance_masks import Box, InstanceMask
+from directshape_torch.io.instance_masks import InstanceMask
+from directshape_torch.io.kitti_labels import KittiObject, parse_object
+from directshape_torch.io.mask_matching import MaskMatches, assign, distinct, hiding, mask_iou, match_masks
+from directshape_torch.scene import Side
 
 SIZE_HW = (200, 600)
+Box = tuple[float, float, float, float]
+NO_BOX = (-1.0, -1.0, -1.0, -1.0)
 
 
-def camera(bias_px: float | None = None) -> StereoCamera:
+def camera() -> StereoCamera:
     K = torch.tensor([[500.0, 0, 300], [0, 500, 100], [0, 0, 1]], dtype=torch.float64)
     T_right_cam = torch.eye(4, dtype=torch.float64)
-    T_right_cam[:3, 3] = torch.tensor([-0.5, 0.01, 0.0])
-    field = None if bias_px is None else DisparityField.constant(bias_px, SIZE_HW[::-1], K, K, T_right_cam)
-    return StereoCamera(K[None], K[None], T_right_cam[None], torch.zeros(1, 3, dtype=torch.float64), field)
+    T_right_cam[0, 3] = -0.5
+    return StereoCamera(K[None], K[None], T_right_cam[None], torch.zeros(1, 3, dtype=torch.float64))
 
 
-def mask(box: tuple[int, int, int, int], *, is_car: bool = True, file_box: Box | None = None) -> InstanceMask:
+def car(
+    line: int, x: float, z: float, box_2d: Box | None = NO_BOX, score: float = 0.9, kind: str = "Car"
+) -> KittiObject:
+    """A car across the view at a place on the ground; without a 2D box of its own (None) that of its projection."""
+    if box_2d is None:
+        box_2d = projected(x, z)[0]
+    numbers = " ".join(map(str, box_2d))
+    text = f"{kind} 0 0 0 {numbers} 1.5 1.6 4.0 {x} 1.6 {z} 0 {score}"
+    return parse_object("frame.txt", Line(line, text, text))
+
+
+def projected(x: float, z: float) -> tuple[Box, Box]:
+    """The 2D boxes of such a car in both images."""
+    T_cam_obj = pose_from_kitti(torch.tensor([[x, 1.6, z]]).double(), torch.zeros(1).double())
+    left, right = project_boxes(T_cam_obj, torch.tensor([[1.5, 1.6, 4.0]]), camera(), SIZE_HW)
+    return tuple(left[0].tolist()), tuple(right[0].tolist())
+
+
+def seen(
+    x: float,
+    z: float,
+    side: Side = "left",
+    number: int = 1,
+    score: float = 1.0,
+    part: tuple[float, float] = (0.0, 1.0),
+    is_car: bool = True,
+) -> InstanceMask:
+    """The mask of a car at a place: its projected box, or a share of its columns."""
+    u0, v0, u1, v1 = projected(x, z)[side == "right"]
+    first, last = (round(u0 + share * (u1 - u0)) for share in part)
+    return square((first, round(v0), last, round(v1)), side, number, score, is_car)
+
+
+def square(
+    box: tuple[int, int, int, int], side: Side = "left", number: int = 1, score: float = 1.0, is_car: bool = True
+) -> InstanceMask:
     pixels = np.zeros(SIZE_HW, bool)
-    pixels[box[1] : box[3] + 1, box[0] : box[2] + 1] = True
-    return InstanceMask("left", 1, is_car, pixels, file_box)
+    pixels[max(0, box[1]) : box[3] + 1, max(0, box[0]) : box[2] + 1] = True
+    mask = InstanceMask.found(side, number, is_car, pixels, score=score)
+    assert mask is not None
+    return mask
 
 
-def test_iou_by_hand() -> None:
-    a = np.array([[0.0, 0, 4, 2], [5, 5, 5, 9]])  # the second has no area
-    b = np.array([[2.0, 0, 6, 2], [0, 0, 4, 2], [10, 10, 12, 12]])
-    np.testing.assert_allclose(box_iou(a, b), [[4 / 12, 1, 0], [0, 0, 0]])
-    assert box_iou(a[:0], b).shape == (0, 3)
+def matched(cars: list[KittiObject], masks: list[InstanceMask]) -> MaskMatches:
+    return match_masks(cars, distinct(masks), camera(), SIZE_HW)
+
+
+def numbers(masks: list[InstanceMask | None]) -> list[int]:
+    return [-1 if mask is None else mask.instance_id for mask in masks]
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10_000), st.integers(0, 4), st.integers(0, 4))
 def test_assignment_equals_the_best_of_all(seed: int, num_detections: int, num_masks: int) -> None:
-    overlap = np.random.default_rng(seed).random((num_detections, num_masks))
-    partners, overlaps = match_one_to_one(overlap)
-    used = partners[partners >= 0]
-    assert len(set(used.tolist())) == len(used)
-    assert (overlaps[partners >= 0] >= 0.3).all()
-    padded = np.hstack([np.where(overlap >= 0.3, overlap, 0.0), np.zeros((num_detections, num_detections))])
+    values = np.random.default_rng(seed).random((num_detections, num_masks)).round(1)
+    partners = assign(values)
+    used = [column for column in partners if column >= 0]
+    assert len(set(used)) == len(used)
+    padded = np.hstack([values, np.zeros((num_detections, num_detections))])
     best = max(
         sum(padded[row, column] for row, column in enumerate(columns))
         for columns in itertools.permutations(range(padded.shape[1]), num_detections)
     )
-    assert overlaps.sum() == pytest.approx(best)
+    assert sum(values[row, column] for row, column in enumerate(partners) if column >= 0) == pytest.approx(best)
 
 
-def test_the_larger_of_file_box_and_mask_box_counts() -> None:
-    box = np.array([[100.0, 50, 200, 100]])
-    hidden_half = mask((100, 50, 120, 100))  # a fifth is visible: IoU 0.2 alone
-    assert match_masks(box, [hidden_half])[0].tolist() == [-1]
-    with_box = mask((100, 50, 120, 100), file_box=(100, 50, 200, 100))
-    assert match_masks(box, [with_box])[1].tolist() == [1.0]
-    wrong_file_box = mask((100, 50, 200, 100), file_box=(0, 0, 10, 10))
-    assert match_masks(box, [wrong_file_box])[1].tolist() == [1.0]
+@pytest.mark.parametrize("box_2d", [None, NO_BOX, (0.0,) * 4, (0.0, 0.0, 50.0, 50.0), (400.0, 300.0, 100.0, 50.0)])
+def test_boxes_of_the_file_are_not_needed(box_2d: Box | None) -> None:
+    """What LiDAR detectors and label tools write where they have no 2D box."""
+    cars = [car(1, -4.0, 15.0, box_2d), car(2, 3.0, 20.0, box_2d)]
+    masks = [seen(x, z, side, n) for n, (x, z) in ((7, (3.0, 20.0)), (8, (-4.0, 15.0))) for side in ("left", "right")]
+    found = matched(cars, masks)  # type: ignore[arg-type]
+    assert numbers(found.left) == numbers(found.right) == [8, 7]
+    assert found.reasons == ["", ""]
+    np.testing.assert_allclose(found.box_2d, [projected(-4.0, 15.0)[0], projected(3.0, 20.0)[0]], atol=1e-6)
 
 
-def test_second_opinion_is_used_where_it_is_there() -> None:
-    boxes = np.array([[0.0, 0, 10, 10], [0, 0, 10, 10]])
-    second = np.array([[np.nan] * 4, [300, 50, 400, 90]])
-    assert match_masks(boxes, [mask((300, 50, 400, 90))], second)[0].tolist() == [-1, 0]
+def test_a_2d_box_helps_where_the_3d_box_is_off() -> None:
+    moved = car(1, 0.0, 15.0, projected(1.9, 15.0)[0])
+    assert numbers(matched([moved], [seen(1.9, 15.0)]).left) == [1]
+    far_off = car(1, -1.5, 15.0)
+    found = matched([far_off], [seen(1.9, 15.0)])
+    assert numbers(found.left) == [-1]
+    assert found.reasons[0].startswith("the best mask fits its box by 0.")
 
 
-def test_projected_boxes_by_hand() -> None:
-    T = pose_from_kitti(torch.tensor([[1.0, 1.5, 20.0]]).double(), torch.zeros(1).double())
-    left, right = project_boxes(T, torch.tensor([[1.5, 2.0, 4.0]]), camera(), SIZE_HW)
-    # Nearest face at z = 19, farthest at 21; x from -1 to 3, y from 0 to 1.5.
-    np.testing.assert_allclose(left, [[300 - 500 / 19, 100, 300 + 1500 / 19, 100 + 750 / 19]])
-    # x is 0.5 less, y 0.01 more.
-    expected = [[300 - 750 / 19, 100 + 5 / 21, 300 + 1250 / 19, 100 + 755 / 19]]
-    np.testing.assert_allclose(right, expected)
+@pytest.mark.parametrize("order", [1, -1])
+def test_of_two_masks_of_a_car_the_score_decides(order: int) -> None:
+    good, bad = seen(0.0, 15.0, number=1, score=0.9), seen(0.3, 15.0, number=2, score=0.05)
+    exact = car(1, 0.3, 15.0)  # which the bad mask fits better
+    assert mask_iou(good, bad) > 0.5
+    assert numbers(matched([exact], [good, bad][::order]).left) == [1]
+    assert numbers(matched([exact], [replace(good, score=0.05), bad][::order]).left) == [2]
+    # A second one that covers the neighbour too is another instance by its overlap, and fits worse.
+    wide = square((250, 105, 480, 150), number=3, score=0.05)
+    assert numbers(matched([exact, car(2, 3.8, 15.0)], [good, wide, seen(3.8, 15.0, number=4)]).left) == [1, 4]
 
 
-def test_right_box_goes_through_the_disparity_field() -> None:
-    T = pose_from_kitti(torch.tensor([[1.0, 1.5, 20.0]]).double(), torch.zeros(1).double())
-    size = torch.tensor([[1.5, 2.0, 4.0]])
-    (_, plain), (_, biased) = (project_boxes(T, size, camera(bias), SIZE_HW) for bias in (None, -0.8))
-    # Measured minus true disparity is -0.8: the car appears 0.8 px farther right.
-    np.testing.assert_allclose(biased - plain, [[0.8, 0, 0.8, 0]], atol=1e-9)
+@pytest.mark.parametrize("order", [1, -1])
+def test_of_two_boxes_of_a_car_the_score_decides(order: int) -> None:
+    boxes = [car(1, 0.4, 15.0, score=0.9), car(2, 0.0, 15.0, score=0.2)][::order]
+    found = matched(boxes, [seen(0.0, 15.0)])
+    assert numbers(found.left) == [1, -1][::order]
+    assert found.reasons[boxes.index(next(o for o in boxes if o.score == 0.2))] == (
+        "its mask belongs to the object of line 1, which fits better or has a higher score"
+    )
+    # Equal scores leave it to the overlap, and a second mask is free for the second box.
+    equal = [car(1, 0.4, 15.0), car(2, 0.0, 15.0)]
+    assert numbers(matched(equal, [seen(0.0, 15.0)]).left) == [-1, 1]
 
 
-def test_boxes_that_reach_behind_the_camera_are_cut_and_hidden_ones_have_no_area() -> None:
-    z = torch.tensor([[2.0, 1.5, 1.0], [0.0, 1.5, -20.0]]).double()
-    T = pose_from_kitti(z, torch.full((2,), -torch.pi / 2).double())
-    left, right = project_boxes(T, torch.tensor([[1.5, 1.6, 4.0]] * 2), camera(), SIZE_HW)
-    assert np.isfinite(left).all()
-    assert np.isfinite(right).all()
-    # The car beside the camera: its nearest visible part is at z = 0.5 and far out to the right.
-    assert left[0, 2] == SIZE_HW[1] - 1
-    assert left[0, 0] == pytest.approx(300 + 500 * 1.2 / 3.0)
-    np.testing.assert_array_equal(box_iou(left[1:], np.array([[0.0, 0, 599, 199]])), [[0.0]])
+def test_a_mask_that_neighbours_cut_belongs_to_its_car() -> None:
+    """The nearer car hides three quarters of the other, whose box alone would not tell."""
+    near, far = seen(0.0, 10.0, number=1), seen(2.6, 16.0, number=2, part=(0.75, 1.0))
+    cars = [car(1, 2.6, 16.0), car(2, 0.0, 10.0)]
+    assert numbers(matched(cars, [near, far]).left) == [2, 1]
+    # Without a detection of the nearer car its mask is not given to the hidden one.
+    assert numbers(matched(cars[:1], [near, far]).left) == [2]
+    assert numbers(matched(cars[:1], [near]).left) == [-1]
 
 
-def test_second_mask_of_a_matched_car_is_no_occluder() -> None:
-    car, again, neighbour = mask((10, 10, 50, 50)), mask((12, 10, 50, 50)), mask((40, 10, 90, 50))
-    (rest,) = without_duplicates([again, neighbour], [car])
-    assert rest is neighbour
-    assert len(without_duplicates([car, again, neighbour], [])) == 3
+def test_objects_of_other_classes_keep_their_masks() -> None:
+    """A van that the segmentation calls a car is not given to the car behind it."""
+    objects = [car(1, 0.5, 17.0), car(2, 0.0, 15.0, kind="Van")]
+    assert numbers(matched(objects, [seen(0.0, 15.0)]).left) == [-1, 1]
+    walker = seen(0.0, 15.0, is_car=False)
+    assert numbers(matched([car(1, 0.0, 15.0)], [walker]).left) == [-1]
+    assert numbers(matched([car(1, 0.0, 15.0, kind="Van")], [walker]).left) == [1]
+
+
+def test_the_right_mask_of_a_hidden_car_is_found_by_way_of_the_left_one() -> None:
+    """A quarter of a car is seen in both images, and what hides it has no mask."""
+    parts = [seen(0.0, 15.0, side, part=(0.0, 0.25)) for side in ("left", "right")]  # type: ignore[arg-type]
+    found = matched([car(1, 0.0, 15.0, (10.0, 10.0, 20.0, 20.0))], parts)
+    assert numbers(found.left) == numbers(found.right) == [1]
+
+
+def test_masks_that_say_where_they_belong_are_believed() -> None:
+    cars = [car(1, -4.0, 15.0), car(2, 3.0, 20.0), car(3, 0.0, 30.0)]
+    masks = [replace(seen(3.0, 20.0, number=8), row=0), replace(seen(-4.0, 15.0, number=9), row=1)]
+    found = matched(cars, masks)
+    assert numbers(found.left) == [8, 9, -1]
+    assert found.reasons[2] == "its entry has no mask"
+
+
+def test_nothing_at_all() -> None:
+    assert matched([], []).left == []
+    assert matched([], [seen(0.0, 15.0)]).right == []
+    alone = matched([car(1, 0.0, 15.0)], [])
+    assert numbers(alone.left) == [-1]
+    assert alone.reasons == ["no mask of the left image lies where its box is"]
+    behind = matched([car(1, 0.0, -15.0)], [seen(0.0, 15.0)])
+    assert numbers(behind.left) == [-1]
+
+
+def test_what_is_left_hides_cars_only_where_it_is_an_instance_of_its_own() -> None:
+    car_mask, again, neighbour = square((10, 10, 50, 50)), square((12, 10, 50, 50)), square((40, 10, 90, 50))
+    assert hiding([again, neighbour], [car_mask]) == [neighbour]
+    assert len(hiding([car_mask, again, neighbour], [])) == 3
+    both = square((10, 10, 90, 50))
+    assert hiding([both], [car_mask, neighbour]) == []
+    assert hiding([replace(neighbour, score=0.4)], [car_mask]) == []
+    other_side = replace(again, side="right")
+    assert hiding([other_side], [car_mask]) == [other_side]

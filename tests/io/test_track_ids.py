@@ -30,9 +30,14 @@ def test_tracks_of_a_result_file_reach_the_detections(kitti: Path, tmp_path: Pat
     assert unasked.load(FRAMES[0]).detections.track_id is None
 
 
-def test_cars_without_numbers_are_associated(kitti: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("box_2d", [None, "-1 -1 -1 -1", "0 0 5 5"])
+def test_cars_without_numbers_are_associated(kitti: Path, tmp_path: Path, box_2d: str | None) -> None:
     write_sequence(kitti, tmp_path, FRAMES, single=True)
-    dataset = open_dataset("tracking", tmp_path, kitti / "detections", kitti / "masks", tracks=True)
+    for name in FRAMES:
+        lines = [line.split() for line in (kitti / "detections" / "data" / f"{name}.txt").read_text().splitlines()]
+        text = "\n".join(" ".join([*w[:4], *(w[4:8] if box_2d is None else [box_2d]), *w[8:]]) for w in lines)
+        write(tmp_path / "detected" / f"{name}.txt", text)
+    dataset = open_dataset("tracking", tmp_path, tmp_path / "detected", kitti / "masks", tracks=True)
     first, second = (dataset.load(frame_id).detections.track_id for frame_id in FRAMES)
     # Both frames show the same cars; the pedestrian's line lies between them.
     assert first.tolist() == second.tolist() == [0, 2]
@@ -41,7 +46,9 @@ def test_cars_without_numbers_are_associated(kitti: Path, tmp_path: Path) -> Non
 def test_instances_of_mots_are_tracks(kitti: Path, tmp_path: Path) -> None:
     write_sequence(kitti, tmp_path, FRAMES, single=True)
     for name in FRAMES:
-        masks = open_dataset("kitti", kitti, kitti / "detections", kitti / "masks").load(name).detections.mask_left
+        masks = (
+            open_dataset("kitti", kitti, kitti / "detections", kitti / "masks").load(name).detections.mask_left.dense()
+        )
         ids = 1008 * (masks[0] > 0.5) + 1005 * ((masks[1] > 0.5) & (masks[0] <= 0.5))
         path = tmp_path / "mots" / "instance_02" / f"{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -29,7 +29,6 @@ def scene(
     box = torch.zeros(count, 4)
     box[:, 3] = torch.tensor(bottom_v)
     masks = torch.zeros(count, HEIGHT, WIDTH) if masks is None else masks
-    present = torch.ones(count, dtype=torch.bool)
     return Detections(
         frame_index=torch.tensor(frame or [0] * count, dtype=torch.long),
         T_cam_obj=T_cam_obj,
@@ -38,8 +37,6 @@ def scene(
         score=torch.ones(count),
         mask_left=masks,
         mask_right=masks.roll(3, dims=2),
-        has_mask_left=present,
-        has_mask_right=present,
         occluders=occluders,
     )
 
@@ -91,9 +88,11 @@ def test_unknown_depth_falls_back_to_the_box(unknown: float) -> None:
 def test_equals_other_frames_and_absent_masks_hide_nothing() -> None:
     assert not instances_in_front(scene([10.0, 10.0], [1.0, 2.0]), "left").any()
     assert not instances_in_front(scene([10.0, 20.0], [2.0, 1.0], frame=[0, 1]), "left").any()
-    blind = replace(scene([10.0, 20.0], [2.0, 1.0]), has_mask_left=torch.tensor([False, True]))
-    assert not instances_in_front(blind, "left").any()
-    assert instances_in_front(blind, "right").any()
+    both = scene([10.0, 20.0], [2.0, 1.0], squares((0, 0, 4, 4), (0, 0, 4, 4)))
+    blind = replace(both, mask_left=both.mask_left.where(torch.tensor([False, True])))
+    index, uv = all_pixels(2)
+    assert hidden_pixels(both, "left", index, uv).any()
+    assert not hidden_pixels(blind, "left", index, uv).any()
 
 
 def test_hidden_pixels_are_the_mask_in_front() -> None:

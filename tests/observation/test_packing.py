@@ -15,8 +15,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from directshape_torch.config import SamplingConfig
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.ground_plane import GroundPlane
-from directshape_torch.observation.extents import scene_extents
-from directshape_torch.observation.packing import Observation, car_regions, pack_pixels
+from directshape_torch.masks import MaskCrops
+from directshape_torch.observation.packing import Observation, car_regions, pack_pixels, region_boxes
 from directshape_torch.scene import Detections, FrameBatch, Occluders, Side
 from tests.helpers.synthetic_scene import stereo_camera
 
@@ -26,7 +26,7 @@ PADDING = 0.77  # grey that must not matter
 def whole_frame_side(frames: FrameBatch, d: Detections, side: Side, regions: Tensor, config: SamplingConfig) -> Any:
     """Object, pixel, foreground and gradient of the chosen pixels of one image: every pixel of every frame is read."""
     images, masks = (
-        (frames.images_left, d.mask_left) if side == "left" else (frames.images_right, d.mask_right)
+        (frames.images_left, d.mask_left.dense()) if side == "left" else (frames.images_right, d.mask_right.dense())
     )  # fmt: skip
     magnitude = gradient_magnitude(images, frames.sizes)
     mode = config.mode if side == "left" else config.mode_right
@@ -77,16 +77,15 @@ def random_scene(seed: int, count: int, num_frames: int = 3, others: int = 4) ->
         depth_m=torch.where(torch.rand(others, generator=generator) > 0.5, depth, torch.nan),
         bottom_v=torch.rand(others, generator=generator) * 100,
     )
+    present = torch.rand(2, count, generator=generator) > 0.1
     detections = Detections(
         frame_index=frame_index,
         T_cam_obj=pose_from_kitti(location, torch.rand(count, generator=generator)),
         dimensions_hwl=torch.ones(count, 3),
         box_2d=torch.cat([low, low + torch.rand(count, 2, generator=generator) * 60], dim=1),
         score=torch.ones(count),
-        mask_left=random_masks(generator, frame_index, sizes, shape),
-        mask_right=random_masks(generator, frame_index, sizes, shape),
-        has_mask_left=torch.rand(count, generator=generator) > 0.1,
-        has_mask_right=torch.rand(count, generator=generator) > 0.1,
+        mask_left=MaskCrops.of(random_masks(generator, frame_index, sizes, shape), present[0]),
+        mask_right=MaskCrops.of(random_masks(generator, frame_index, sizes, shape), present[1]),
         occluders=occluders if others else None,
     )
     return frames, detections
@@ -108,7 +107,7 @@ def test_random_scenes_equal_the_whole_frame_form(seed: int) -> None:
     frames, detections = random_scene(seed, count=9)
     seen = assert_equal_to_whole_frames(frames, detections, SamplingConfig())
     assert len(seen.left) > 100
-    assert torch.equal(seen.mask_areas, scene_extents(detections).areas)
+    assert torch.equal(seen.mask_areas[:, 0], detections.mask_left.areas)
 
 
 @pytest.mark.parametrize("mode", ["adaptive", "uniform", "dense"])
@@ -149,7 +148,7 @@ def test_hidden_in_the_right_image_wherever_a_car_may_land(seed: int) -> None:
 def test_gradients_reach_images_and_masks() -> None:
     frames, detections = random_scene(5, count=4)
     attached = frames.images_left.clone().requires_grad_()
-    mask = detections.mask_right.clone().requires_grad_()
+    mask = detections.mask_right.dense().requires_grad_()
     seen = pack_pixels(replace(frames, images_left=attached), replace(detections, mask_right=mask), SamplingConfig())
     (seen.left.gradient_magnitude.sum() + seen.right.foreground.sum()).backward()
     reference = frames.images_left.clone().requires_grad_()
@@ -188,15 +187,16 @@ def enlarged(frames: FrameBatch, d: Detections, factor: int) -> tuple[FrameBatch
         name: torch.nn.functional.pad(getattr(frames, name), more, value=PADDING)
         for name in ("images_left", "images_right")
     }
-    masks = {name: torch.nn.functional.pad(getattr(d, name), more) for name in ("mask_left", "mask_right")}
+    size_hw = (factor * height, factor * width)
+    masks = {name: getattr(d, name).padded(size_hw) for name in ("mask_left", "mask_right")}
     return replace(frames, sizes=frames.sizes * factor, **images), replace(d, **masks)
 
 
 def touched_by_packing(frames: FrameBatch, d: Detections) -> int:
     """Elements touched by all but finding the masks' extents."""
-    extents = scene_extents(d)
+    _ = d.mask_left.areas, d.mask_right.areas
     with TouchedElements() as packing:
-        pack_pixels(frames, d, SamplingConfig(), extents)
+        pack_pixels(frames, d, SamplingConfig())
     return packing.count
 
 
@@ -204,3 +204,26 @@ def test_work_follows_the_cars_and_not_the_frame() -> None:
     frames, detections = random_scene(6, count=5, num_frames=1, others=0)
     small, large = (touched_by_packing(*enlarged(frames, detections, factor)) for factor in (4, 8))
     assert large < 1.02 * small
+
+
+def boxes_of(mask_box: tuple[int, int, int, int] | None, box: list[float]) -> list[int]:
+    mask_boxes = torch.zeros(1, 4, dtype=torch.long)
+    if mask_box is not None:
+        u0, v0, u1, v1 = mask_box
+        mask_boxes[0] = torch.tensor([u0, v0, u1 + 1, v1 + 1])
+    result: list[int] = region_boxes(torch.tensor([box]), mask_boxes, torch.tensor([[100, 200]]))[0].tolist()
+    return result
+
+
+def test_region_joins_mask_and_box_and_grows() -> None:
+    # Joined: u 40..100, v 30..50. Margins: 10 % of 60 = 6 horizontally, 4 at least vertically. Half open: + 1.
+    assert boxes_of((40, 35, 70, 50), [60.0, 30.0, 100.0, 45.0]) == [34, 26, 107, 55]
+    assert boxes_of(None, [60.0, 30.0, 100.5, 45.0]) == [55, 26, 106, 50]
+
+
+def test_region_is_clipped_and_may_be_empty() -> None:
+    assert boxes_of(None, [-500.0, -20.0, 10.0, 40.0]) == [0, 0, 15, 45]
+    assert boxes_of(None, [150.0, 60.0, 900.0, 300.0]) == [145, 56, 200, 100]
+    for nowhere in ([-50.0, 0.0, -1.0, 9.0], [200.0, 0.0, 230.0, 9.0], [torch.nan] * 4, [20.0, 20.0, 10.0, 30.0]):
+        assert boxes_of(None, nowhere) == [0, 0, 0, 0]
+        assert boxes_of((40, 40, 60, 60), nowhere) == [36, 36, 65, 65]

@@ -7,8 +7,9 @@ import math
 import torch
 from torch import Tensor
 
+from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.observation.occlusion import OcclusionOrder
-from directshape_torch.scene import MASK_THRESHOLD, Detections, Side
+from directshape_torch.scene import Detections, Side
 
 
 def instances_in_front(detections: Detections, side: Side, order: OcclusionOrder = "depth") -> Tensor:
@@ -41,8 +42,8 @@ def hidden_pixels(
 ) -> Tensor:  # (P,) bool
     """Whether each pixel of an object is covered by the mask of an instance in front of it."""
     sources = [detections] if detections.occluders is None else [detections, detections.occluders]
-    masks = [mask for source in sources for mask in getattr(source, f"mask_{side}").unbind()]
-    height, width = detections.mask_left.shape[1:]
+    masks = [mask for source in sources for mask in getattr(source, f"mask_{side}")]
+    height, width = detections.mask_left.size_hw
     inside = (uv >= 0).all(dim=1) & (uv[:, 0] < width) & (uv[:, 1] < height)
     u, v = torch.where(inside[:, None], uv, 0).unbind(1)
     hidden = torch.zeros_like(inside)

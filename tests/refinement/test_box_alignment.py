@@ -9,7 +9,7 @@ import pytest
 import torch
 from helpers.ellipsoids import CENTRE_OBJ, HALF_AXES, ellipsoid_prior
 from helpers.problems import DEFAULT
-from helpers.synthetic_scene import TWO_CARS, Street, joined_detections, joined_frames, select, street
+from helpers.synthetic_scene import TWO_CARS, Street, joined_detections, joined_frames, masked, select, street
 from reference.rays import RaysObj
 
 from directshape_torch.errors import ConfigError, InputError
@@ -93,12 +93,12 @@ def test_a_car_that_cannot_be_aligned_keeps_its_input_and_touches_no_other() -> 
     grey = torch.full_like(frames.images_left, 0.5)
     assert aligned(replace(frames, images_left=grey, images_right=grey), detections).status == [Status.no_evidence] * 2
     # Not up to its contour, where the neighbourhoods of the other car's pixels end.
-    inner = 1 - torch.nn.functional.max_pool2d(1 - detections.mask_left[1:], 9, 1, 4)
+    inner = 1 - torch.nn.functional.max_pool2d(1 - detections.mask_left.dense()[1:], 9, 1, 4)
     spoilt = replace(frames, images_left=torch.where(inner > 0.5, torch.nan, frames.images_left))
     first = torch.tensor([True, False])
     for some_frames, some, status in (
         (spoilt, detections, Status.non_finite),
-        (frames, replace(detections, has_mask_left=first, has_mask_right=first), Status.no_mask),
+        (frames, masked(detections, first, first), Status.no_mask),
     ):
         result = aligned(some_frames, some)
         assert result.status == [Status.converged, status]

@@ -11,7 +11,7 @@ import pytest
 import torch
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import CONFIGS, DEFAULT, begun_stage, figures_at, photometric_of
-from helpers.synthetic_scene import CAMERA_HEIGHT_M, Street, cached_street, disturbed, select, street
+from helpers.synthetic_scene import CAMERA_HEIGHT_M, Street, cached_street, disturbed, masked, select, street
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
@@ -136,9 +136,7 @@ def test_in_a_result_each_car_has_its_own_curve_and_cars_that_were_not_refined_h
         alone = refiner(scene.frames, select(detections, torch.tensor([row]))).profile
         torch.testing.assert_close(together.cost_after[row], alone.cost_after[0], rtol=1e-6, atol=1e-6)
         torch.testing.assert_close(together.cost_before[row], alone.cost_before[0], rtol=1e-6, atol=1e-6)
-    maskless = replace(
-        detections, has_mask_left=torch.tensor([True, False]), has_mask_right=torch.tensor([True, False])
-    )
+    maskless = masked(detections, torch.tensor([True, False]), torch.tensor([True, False]))
     found = refiner(scene.frames, maskless).profile
     assert found.cost_after[0].isfinite().all()
     for figure in (found.cost_before, found.cost_after, found.num_pixels):
@@ -199,9 +197,9 @@ def test_without_a_pixel_there_is_no_curve_and_a_car_without_them_touches_no_oth
         stage, state = begun(scene.frames, masked)
         return profile_at(stage, state, state)
 
-    expected = with_masks(scene.detections.mask_left)
+    expected = with_masks(scene.detections.mask_left.dense())
     for empty in ([0], [1], [0, 1]):
-        masks = scene.detections.mask_left.clone()
+        masks = scene.detections.mask_left.dense()
         masks[empty] = 0
         found = with_masks(masks)
         for car in range(2):

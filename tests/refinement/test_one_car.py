@@ -94,7 +94,7 @@ def unlike(change: str | None = None) -> Tensor:
     ]
     frames = joined_frames([view.frames for view in seen])
     detections = joined_detections([view.detections for view in seen], (140, 190))
-    mask = detections.mask_left.clone()
+    mask = detections.mask_left.dense()
     cuts = {"cut at the left": (60, 0), "cut at the right": (60, 159), "cut below": (119, 80)}
     if change == "painted" or change in cuts:
         frames.images_left[1, :, mask[1] > 0] = 1 - frames.images_left[1, :, mask[1] > 0]

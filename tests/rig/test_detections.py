@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.synthetic_scene import masked
 from torch import Tensor
 
 import directshape_torch
@@ -95,7 +96,7 @@ def test_a_box_beyond_all_numbers_has_no_size_in_the_image(row: int) -> None:
 
 def test_without_masks_the_boxes_themselves_are_looked_at(demo: LoadedFrame) -> None:
     with_masks = observe_detections(demo.frame, demo.detections)
-    blind = replace(demo.detections, has_mask_left=torch.zeros(len(demo.detections), dtype=torch.bool))
+    blind = masked(demo.detections, torch.zeros(len(demo.detections), dtype=torch.bool))
     without = observe_detections(demo.frame, blind)
     assert len(without) >= 3
     assert difference(without, OFFSET, with_masks) < 0.3

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.synthetic_scene import CAMERA_HEIGHT_M, measured_street
+from helpers.synthetic_scene import CAMERA_HEIGHT_M, masked, measured_street
 
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.errors import InputError
@@ -29,14 +29,15 @@ def wide(monkeypatch: pytest.MonkeyPatch) -> None:
 def points_of(config: PointCloudConfig = ALL, **changes: object) -> PointSamples:
     scene = measured_street()[1]
     frames = {name: value for name, value in changes.items() if name == "disparity"}
-    others = {name: value for name, value in changes.items() if name != "disparity"}
-    return car_points(replace(scene.frames, **frames), replace(scene.detections, **others), config)  # type: ignore[arg-type]
+    others = {name: value for name, value in changes.items() if name not in ("disparity", "present")}
+    detections = masked(scene.detections, changes.get("present"))  # type: ignore[arg-type]
+    return car_points(replace(scene.frames, **frames), replace(detections, **others), config)  # type: ignore[arg-type]
 
 
 def test_every_masked_pixel_gives_a_point_on_the_surface() -> None:
     prior, scene = measured_street()
     points = points_of()
-    assert torch.equal(points.counts, (scene.detections.mask_left > 0.5).flatten(1).sum(1))
+    assert torch.equal(points.counts, (scene.detections.mask_left.dense() > 0.5).flatten(1).sum(1))
     assert torch.equal(torch.bincount(points.object_index), points.counts)
     T = se3.inverse(scene.detections.T_cam_obj)[points.object_index]
     sdf = prior.bind(scene.code).value(se3.transform(T, points.points_cam), points.object_index)
@@ -70,15 +71,15 @@ NO_MASK = torch.tensor([False, False])
 
 def test_without_a_mask_the_box_counts() -> None:
     detections = measured_street()[1].detections
-    box = points_of(has_mask_left=NO_MASK)
+    box = points_of(present=NO_MASK)
     # Where the map knows nothing there is no point, so the first car's box holds its own pixels and some of the other.
     assert (box.counts >= points_of().counts).all()
     absent = torch.tensor([True, False])
-    mixed = points_of(has_mask_left=absent)
+    mixed = points_of(present=absent)
     assert torch.equal(mixed.counts, torch.where(absent, points_of().counts, box.counts))
     narrow = detections.box_2d.clone()
     narrow[:, 2] = narrow[:, 0] + 4
-    assert (points_of(has_mask_left=NO_MASK, box_2d=narrow).counts < box.counts).all()
+    assert (points_of(present=NO_MASK, box_2d=narrow).counts < box.counts).all()
 
 
 @pytest.mark.parametrize("unknown", [torch.nan, 0.0, -1.0, torch.inf])
@@ -89,7 +90,7 @@ def test_pixels_without_a_disparity_give_no_point(unknown: float) -> None:
     spoiled[:, :, ::2] = unknown
     points = points_of(disparity=spoiled)
     assert points.points_cam.isfinite().all()
-    assert torch.equal(points.counts, (scene.detections.mask_left[:, :, 1::2] > 0.5).flatten(1).sum(1))
+    assert torch.equal(points.counts, (scene.detections.mask_left.dense()[:, :, 1::2] > 0.5).flatten(1).sum(1))
 
 
 def test_the_padding_of_a_smaller_frame_holds_no_points() -> None:
@@ -98,7 +99,7 @@ def test_the_padding_of_a_smaller_frame_holds_no_points() -> None:
     filled = scene.frames.disparity.nan_to_num(nan=7.0)
     frames = replace(scene.frames, disparity=filled, sizes=torch.tensor([[80, 70]]))
     box_2d = torch.tensor([[0.0, 0.0, 159.0, 119.0]]).double().expand(2, 4)
-    everywhere = replace(scene.detections, has_mask_left=NO_MASK, box_2d=box_2d)
+    everywhere = replace(masked(scene.detections, NO_MASK), box_2d=box_2d)
     assert car_points(frames, everywhere, ALL).counts.tolist() == [80 * 70] * 2
 
 

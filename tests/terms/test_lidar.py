@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers.ellipsoids import ellipsoid_prior
-from helpers.synthetic_scene import TWO_CARS, disturbed, street
+from helpers.synthetic_scene import TWO_CARS, disturbed, masked, street
 from torch import Tensor
 
 from directshape_torch.errors import InputError
@@ -23,7 +23,7 @@ SCENE = street(PRIOR, *TWO_CARS)
 def seen(car: int, depth_offset: float = 0.0) -> Tensor:
     """Points (P, 3) on some rays of the left mask of a car, at the depth of its origin or off it."""
     d = SCENE.detections
-    v, u = (d.mask_left[car] > 0.5).nonzero(as_tuple=True)
+    v, u = (d.mask_left.dense()[car] > 0.5).nonzero(as_tuple=True)
     rays = rays_from_pixels(torch.stack([u, v], dim=-1).to(d.score), SCENE.frames.camera.K_left)
     points = rays * (d.T_cam_obj[car, 2, 3] + depth_offset)
     return points[SCENE.frames.ground.offset[0] - points[:, 1] > 0.2][::2]
@@ -47,7 +47,7 @@ def test_points_of_each_mask_near_the_box_and_above_the_ground() -> None:
 
 
 def test_without_a_mask_the_box_counts() -> None:
-    detections = replace(SCENE.detections, has_mask_left=torch.tensor([False, True]))
+    detections = masked(SCENE.detections, torch.tensor([False, True]))
     u_min, v_min, _, _ = detections.box_2d[0].unbind()
     corner = (
         rays_from_pixels(torch.stack([u_min, v_min]) + 1, SCENE.frames.camera.K_left) * detections.T_cam_obj[0, 2, 3]

@@ -123,7 +123,7 @@ def test_a_pixel_that_lands_on_a_nearer_cars_mask_is_not_compared() -> None:
             _, landed, _ = reference.photometric(term, 0, depth)
             far = (term.blocks.owner == 1)[:, None] & (term.pixel_set.rows.pixel_weight > 0)
             u, v = landed[..., DSO_PATTERN.index((0, 0)), :][far].round().long().unbind(-1)
-            assert (scene.detections.mask_right[0, v, u] < 0.5).all()
+            assert (scene.detections.mask_right.dense()[0, v, u] < 0.5).all()
     assert support[0][0] == support[1][0]
     assert support[0][1] < support[1][1]
 

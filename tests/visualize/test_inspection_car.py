@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers.synthetic_scene import masked
 
 from directshape_torch.cli.demo import demo_dataset
 from directshape_torch.errors import InputError
@@ -54,7 +55,7 @@ def test_residuals_of_the_pixels_make_the_costs_of_the_trace(course: CarCourse, 
 def test_silhouette_residuals_stand_where_shape_and_mask_differ(course: CarCourse, side: int) -> None:
     """The drawn shape and the energy agree on what of the mask is left empty and where the shape spills out of it."""
     pixels, d = course.trace.residuals(0)[_CAR][side], course.loaded.detections
-    mask = (d.mask_left, d.mask_right)[side][_CAR].numpy() > 0.5
+    mask = (d.mask_left.dense(), d.mask_right.dense())[side][_CAR].numpy() > 0.5
     surface = course.cars[0].surface
     assert surface is not None
     shape = silhouette_mask(View.of_frame(course.loaded.frame, ("left", "right")[side]), surface) > 0
@@ -76,7 +77,7 @@ def test_photometric_residuals_fall_and_hardly_a_pixel_is_lost(course: CarCourse
     assert term is not None
     assert len(after.uv) == int(term.pixel_set.support[course.trace.place_of(_CAR)])
     u, v = after.uv.astype(int).T
-    assert course.loaded.detections.mask_left[_CAR].numpy()[v, u].mean() > 0.9
+    assert course.loaded.detections.mask_left.dense()[_CAR].numpy()[v, u].mean() > 0.9
 
 
 def test_costs_end_at_those_of_the_result(course: CarCourse) -> None:
@@ -161,7 +162,7 @@ def test_brightness_is_matched_where_the_run_matched_it(course: CarCourse) -> No
 def test_without_a_mask_there_are_none(course: CarCourse) -> None:
     detections = course.loaded.detections
     none = torch.zeros_like(detections.has_mask_left)
-    found = at_the_end(course, replace(course.loaded, detections=replace(detections, has_mask_left=none)))
+    found = at_the_end(course, replace(course.loaded, detections=masked(detections, none)))
     assert [len(values.uv) for values in found[::2]] == [0, 0]
     view = View.of_frame(course.loaded.frame)
     draw_residuals(view, found, "photometric")

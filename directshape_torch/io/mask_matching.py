@@ -1,0 +1,294 @@
+"""Which instance mask belongs to which object of a frame, by pixels: one assignment for all objects in an image.
+
+An object is expected in regions of the image: in the outline of its projected 3D box; in the detector's 2D box, where
+that is of the same place; and in the right image where the disparity of its 3D box moves its left mask. How well a mask
+fits a region is `i / (m + f / 2)`, with the pixels i of the mask in the region, all pixels m of the mask, and the
+pixels f of the region that no mask covers. What another instance covers of a region says nothing against a mask, and
+what is in no mask may be hidden by something without one, so that it counts half.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from directshape_torch.geometry.image_boxes import box_iou, box_outlines, enclosing_boxes
+from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.io.instance_masks import InstanceMask
+from directshape_torch.io.kitti_labels import KittiObject, poses_cam
+from directshape_torch.scene import SIDES, Side
+
+MIN_OVERLAP = 0.35
+# Two masks of one image that share more than this are the same object seen twice by the segmentation.
+DUPLICATE_MASK_IOU = 0.5
+# What a mask counts for a box, where it fits another one of a higher score nearly as well.
+_SECOND_CHOICE, _NEARLY = 0.5, 0.8
+_FREE_PIXELS = 0.5
+# Beyond any image, but within the integers of the drawing.
+_FARTHEST_PX = 30000.0
+
+_Pixels = tuple[tuple[int, int], NDArray[np.bool_]]
+"""Upper left corner (u, v) and the pixels (h, w) from there on."""
+
+
+@dataclass(frozen=True)
+class MaskMatches:
+    """The masks of B objects, and why some have none."""
+
+    left: list[InstanceMask | None]
+    right: list[InstanceMask | None]
+    # For each object without a left mask the reason, else "".
+    reasons: list[str]
+    # (B, 4) of the left image: the detector's 2D box, or that of the projected 3D box where there is none of use.
+    box_2d: NDArray[np.float64]
+
+    def of_side(self, side: Side) -> list[InstanceMask | None]:
+        """The masks in one image."""
+        return self.left if side == "left" else self.right
+
+
+def match_masks(
+    objects: Sequence[KittiObject],
+    masks: Sequence[InstanceMask],
+    camera: StereoCamera,  # of one frame
+    size_hw: tuple[int, int],
+    classes: frozenset[str] = frozenset({"Car"}),
+) -> MaskMatches:
+    """Match the masks of both images to objects with a 3D box, one to one.
+
+    Masks belong to objects as they say themselves (`InstanceMask.row`), else by pixels. Masks that are no car's match
+    objects of other classes only.
+
+    Args:
+        objects: all with a 3D box, of any class.
+        masks: of both images.
+        classes: the objects that are refined.
+    """
+    own = {(mask.side, mask.row): mask for mask in masks if mask.row is not None}
+    outlines = dict(zip(SIDES, _outlines(objects, camera), strict=True))
+    projected = {side: enclosing_boxes(outlines[side], size_hw) for side in SIDES}
+    box_2d, has_box = _box_2d(objects, projected["left"])
+    if own:
+        left, right = ([own.get((side, o.line_number - 1)) for o in objects] for side in SIDES)
+        return MaskMatches(left, right, ["its entry has no mask" if mask is None else "" for mask in left], box_2d)
+    hulls = {side: [_hull(uv, size_hw) for uv in outlines[side]] for side in SIDES}
+    is_wanted = [o.type in classes for o in objects]
+    scores = np.array([0.0 if o.score is None else o.score for o in objects])
+
+    def matched(side: Side, regions: Sequence[Sequence[_Pixels | None]]) -> tuple[list[InstanceMask | None], list[str]]:
+        of_side = [mask for mask in masks if mask.side == side]
+        fits = _fits(regions, of_side, size_hw)
+        allowed = np.array([[mask.is_car or not wanted for mask in of_side] for wanted in is_wanted], dtype=bool)
+        fits = np.where(allowed.reshape(fits.shape), fits, 0.0)
+        index = assign(np.where(fits >= MIN_OVERLAP, fits * _choices(fits, scores), 0.0))
+        return [of_side[k] if k >= 0 else None for k in index], _reasons(fits, index, objects)
+
+    boxes = [_rectangle(box, size_hw) if has else None for box, has in zip(box_2d, has_box, strict=True)]
+    left, reasons = matched("left", [hulls["left"], boxes])
+    shift = projected["right"] - projected["left"]
+    moved = [_moved(mask, dx) for mask, dx in zip(left, shift[:, [0, 2]].mean(axis=1), strict=True)]
+    right, _ = matched("right", [hulls["right"], moved])
+    return MaskMatches(left, right, reasons, box_2d)
+
+
+def with_image_boxes(
+    objects: Sequence[KittiObject], camera: StereoCamera, size_hw: tuple[int, int]
+) -> list[KittiObject]:
+    """The objects with the 2D boxes of their projected 3D boxes where those of the file are of no use."""
+    boxes = [o for o in objects if o.has_box_3d]
+    box_2d, _ = _box_2d(boxes, enclosing_boxes(_outlines(boxes, camera)[0], size_hw))
+    known = iter(box_2d.tolist())
+    return [replace(o, box_2d=tuple(next(known))) if o.has_box_3d else o for o in objects]
+
+
+def _outlines(
+    objects: Sequence[KittiObject], camera: StereoCamera
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # (B, P, 2), (B, P, 2)
+    """Points around the 3D boxes in both images."""
+    T_cam_obj = poses_cam(objects, camera.t_cam_ref[0])
+    return box_outlines(T_cam_obj, torch.tensor([o.hwl for o in objects], dtype=T_cam_obj.dtype).reshape(-1, 3), camera)
+
+
+def _box_2d(
+    objects: Sequence[KittiObject],
+    projected: NDArray[np.float64],  # (B, 4) of the left image
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:  # (B, 4), (B,)
+    """The file's 2D boxes where they overlap the projected ones, else these, or NaN where the image shows nothing.
+
+    Returns them, and where they are the file's.
+    """
+    given = np.array([o.box_2d for o in objects], dtype=np.float64).reshape(-1, 4)
+    has_box = box_iou(given, projected).diagonal() > 0
+    is_seen = (projected[:, 2:] > projected[:, :2]).all(axis=1, keepdims=True)
+    return np.where(has_box[:, None], given, np.where(is_seen, projected, np.nan)), has_box
+
+
+def assign(
+    values: NDArray[np.float64],  # (B, M)
+) -> list[int]:
+    """The assignment of largest total value (Hungarian): for each row its column, or -1; zeros pair nobody.
+
+    Examples:
+        >>> assign(np.array([[0.9, 0.8], [0.7, 0.1]]))
+        [1, 0]
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    rows, columns = linear_sum_assignment(values, maximize=True)
+    index = [-1] * len(values)
+    for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
+        if values[row, column] > 0:
+            index[row] = column
+    return index
+
+
+def distinct(masks: Sequence[InstanceMask]) -> list[InstanceMask]:
+    """The masks without those that share more than a half with one of their image that has a higher score."""
+    kept: dict[Side, list[InstanceMask]] = {side: [] for side in SIDES}
+    for mask in sorted(masks, key=lambda mask: -mask.score):
+        others = kept[mask.side]
+        box, boxes = (np.array([each.mask_box for each in some]).reshape(-1, 4) for some in ([mask], others))
+        near = np.flatnonzero(box_iou(box, boxes)[0] > 0).tolist()
+        if not any(others[k].score > mask.score and mask_iou(mask, others[k]) > DUPLICATE_MASK_IOU for k in near):
+            others.append(mask)
+    numbers = {id(mask) for some in kept.values() for mask in some}
+    return [mask for mask in masks if id(mask) in numbers]
+
+
+def hiding(masks: Sequence[InstanceMask], matched: Sequence[InstanceMask]) -> list[InstanceMask]:
+    """Those of the masks of no detection that may hide cars.
+
+    One that lies for more than a half on masks of detections shows these, and one whose score is not above one half is
+    as likely no instance at all.
+    """
+    return [mask for mask in masks if mask.score > 0.5 and _share_on(mask, matched) <= 0.5]
+
+
+def _share_on(mask: InstanceMask, others: Sequence[InstanceMask]) -> float:
+    """The share of the pixels of a mask that lie on others of its image."""
+    covered = np.zeros_like(mask.inside)
+    for other in others:
+        if other.side == mask.side:
+            for place, theirs in _overlap((mask.corner, mask.inside), (other.corner, other.inside)):
+                covered[place] |= other.inside[theirs]
+    return float((covered & mask.inside).sum() / mask.inside.sum())
+
+
+def _fits(
+    regions: Sequence[Sequence[_Pixels | None]], masks: Sequence[InstanceMask], size_hw: tuple[int, int]
+) -> NDArray[np.float64]:
+    """How well (B, M) each mask fits the best of the regions of each object."""
+    is_free = np.ones(size_hw, dtype=bool)
+    for mask in masks:
+        (u, v), (height, width) = mask.corner, mask.inside.shape
+        is_free[v : v + height, u : u + width] &= ~mask.inside
+    areas = [int(mask.inside.sum()) for mask in masks]
+    boxes = np.array([mask.mask_box for mask in masks], dtype=np.float64).reshape(-1, 4)
+    fits = np.zeros((len(regions[0]), len(masks)))
+    for kind in regions:
+        for row, region in enumerate(kind):
+            if region is None or not len(masks):
+                continue
+            (u, v), inside = region
+            height, width = inside.shape
+            free = int((is_free[v : v + height, u : u + width] & inside).sum())
+            near = (boxes[:, 0] < u + width) & (boxes[:, 2] >= u) & (boxes[:, 1] < v + height) & (boxes[:, 3] >= v)
+            for column in np.flatnonzero(near).tolist():
+                common = _common(region, (masks[column].corner, masks[column].inside))
+                fits[row, column] = max(fits[row, column], common / (areas[column] + _FREE_PIXELS * free))
+    return fits
+
+
+def _overlap(a: _Pixels, b: _Pixels) -> list[tuple[tuple[slice, slice], tuple[slice, slice]]]:
+    """The part of both crops that is the same part of the image, as a part of each; nothing where they are apart."""
+    (ua, va), (ub, vb) = a[0], b[0]
+    u0, v0 = max(ua, ub), max(va, vb)
+    u1, v1 = min(ua + a[1].shape[1], ub + b[1].shape[1]), min(va + a[1].shape[0], vb + b[1].shape[0])
+    if u1 <= u0 or v1 <= v0:
+        return []
+    return [
+        (
+            (slice(v0 - va, v1 - va), slice(u0 - ua, u1 - ua)),
+            (slice(v0 - vb, v1 - vb), slice(u0 - ub, u1 - ub)),
+        )
+    ]
+
+
+def _common(a: _Pixels, b: _Pixels) -> int:
+    """Pixels that are in both."""
+    return sum(int((a[1][of_a] & b[1][of_b]).sum()) for of_a, of_b in _overlap(a, b))
+
+
+def mask_iou(a: InstanceMask, b: InstanceMask) -> float:
+    """Intersection over union of the pixels of two masks of one image."""
+    common = _common((a.corner, a.inside), (b.corner, b.inside))
+    return common / (int(a.inside.sum()) + int(b.inside.sum()) - common) if common else 0.0
+
+
+def _choices(
+    fits: NDArray[np.float64],  # (B, M)
+    scores: NDArray[np.float64],  # (B,) of the objects
+) -> NDArray[np.float64]:  # (B, M)
+    """One, and less where a mask fits an object of a higher score nearly as well: there are two boxes of one car."""
+    factors = np.ones_like(fits)
+    for row, score in enumerate(scores.tolist()):
+        better = fits[scores > score]
+        if len(better):
+            factors[row] = np.where(better.max(axis=0) >= _NEARLY * fits[row], _SECOND_CHOICE, 1.0)
+    return factors
+
+
+def _reasons(fits: NDArray[np.float64], index: Sequence[int], objects: Sequence[KittiObject]) -> list[str]:
+    """For each object without a mask why, else ""."""
+    taken_by = {column: objects[row].line_number for row, column in enumerate(index) if column >= 0}
+    reasons = []
+    for row, column in enumerate(index):
+        best = int(fits[row].argmax()) if fits.shape[1] else -1
+        if column >= 0:
+            reasons.append("")
+        elif best < 0 or fits[row, best] == 0:
+            reasons.append("no mask of the left image lies where its box is")
+        elif fits[row, best] < MIN_OVERLAP:
+            reasons.append(f"the best mask fits its box by {fits[row, best]:.2f}, less than {MIN_OVERLAP}")
+        else:
+            owner = taken_by.get(best)
+            reasons.append(f"its mask belongs to the object of line {owner}, which fits better or has a higher score")
+    return reasons
+
+
+def _hull(uv: NDArray[np.float64], size_hw: tuple[int, int]) -> _Pixels | None:
+    """The pixels within the hull of points (P, 2), of which NaN are left out; None where none is in the image."""
+    seen = uv[np.isfinite(uv).all(axis=1)]
+    if not len(seen):
+        return None
+    height, width = size_hw
+    clipped = seen.clip(-_FARTHEST_PX, _FARTHEST_PX)
+    low = clipped.min(axis=0).round().clip(0, [width, height]).astype(int)
+    high = (clipped.max(axis=0).round() + 1).clip(0, [width, height]).astype(int)
+    if (high <= low).any():
+        return None
+    canvas = np.zeros((high[1] - low[1], high[0] - low[0]), dtype=np.uint8)
+    hull = cv2.convexHull(clipped.astype(np.float32))[:, 0]
+    cv2.fillConvexPoly(canvas, (hull - low).round().astype(np.int32), 1)
+    return (int(low[0]), int(low[1])), canvas.astype(bool)
+
+
+def _rectangle(box: NDArray[np.float64], size_hw: tuple[int, int]) -> _Pixels | None:
+    """The pixels of a box u_min, v_min, u_max, v_max in the image."""
+    u0, v0, u1, v1 = box
+    return _hull(np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]]), size_hw)
+
+
+def _moved(mask: InstanceMask | None, shift_px: float) -> _Pixels | None:
+    """A left mask moved by the disparity of its object; a car shows about the same part of itself in both images."""
+    if mask is None or not np.isfinite(shift_px):
+        return None
+    u, v = mask.corner
+    cut = max(0, -(u + round(shift_px)))
+    inside = mask.inside[:, cut:]
+    return ((max(0, u + round(shift_px)), v), inside) if inside.size else None

@@ -1,0 +1,169 @@
+"""Masks as crops: nothing is lost, whatever form masks come in, and what is in none takes no memory."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from directshape_torch.errors import InputError
+from directshape_torch.masks import MaskCrops
+
+
+def plain_extents(masks: Tensor) -> tuple[list[list[int]], list[int]]:
+    """Boxes and areas of the foreground, of every pixel of every mask, one mask at a time."""
+    boxes, areas = [], []
+    for mask in masks:
+        v, u = (~(mask <= 0.5)).nonzero(as_tuple=True)
+        boxes.append([int(u.min()), int(v.min()), int(u.max()) + 1, int(v.max()) + 1] if len(u) else [0, 0, 0, 0])
+        areas.append(len(u))
+    return boxes, areas
+
+
+def random_masks(count: int, generator: torch.Generator) -> Tensor:
+    """Soft masks in some part of the image, some with NaN, some empty."""
+    masks = torch.zeros(count, 23, 31)
+    for mask in masks:
+        u, v, w, h = (int(torch.randint(n, (1,), generator=generator)) for n in (30, 22, 12, 12))
+        mask[v : v + h, u : u + w] = torch.rand(mask[v : v + h, u : u + w].shape, generator=generator)
+        mask[torch.rand(23, 31, generator=generator) > 0.999] = torch.nan
+    return masks
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_crops_hold_every_pixel_and_find_the_foreground(seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    masks = random_masks(6, generator)
+    crops = MaskCrops.of(masks)
+    torch.testing.assert_close(crops.dense(), masks, equal_nan=True, rtol=0, atol=0)
+    assert (crops.extents.tolist(), crops.areas.tolist()) == plain_extents(masks)
+    v, u = torch.meshgrid(torch.arange(-2, 25), torch.arange(-2, 33), indexing="ij")
+    looked_up = crops.at(torch.arange(6)[:, None, None], u, v)
+    expected = torch.nn.functional.pad(masks, (2, 2, 2, 2))
+    torch.testing.assert_close(looked_up, expected, equal_nan=True, rtol=0, atol=0)
+
+
+def test_corners_and_whole_frames() -> None:
+    masks = torch.zeros(5, 4, 6)
+    masks[0, 3, 5] = masks[1, 0, 0] = masks[3] = 1.0
+    masks[4, 0, 0] = masks[4, 3, 5] = 1.0
+    crops = MaskCrops.of(masks)
+    assert crops.extents.tolist() == [[5, 3, 6, 4], [0, 0, 1, 1], [0, 0, 0, 0], [0, 0, 6, 4], [0, 0, 6, 4]]
+    assert crops.areas.tolist() == [1, 1, 0, 24, 2]
+    assert crops.box_2d[:2].tolist() == [[5, 3, 5, 3], [0, 0, 0, 0]]
+    assert crops.box_2d[2].isnan().all()
+
+
+SQUARE = np.zeros((4, 6), dtype=bool)
+SQUARE[1:3, 2:5] = True
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [
+        SQUARE,
+        SQUARE.astype(np.uint8),
+        SQUARE.astype(np.uint8) * 255,
+        SQUARE.astype(np.float32),
+        SQUARE.astype(np.float64),
+        SQUARE[::-1][::-1],
+        torch.from_numpy(SQUARE),
+        torch.from_numpy(SQUARE).half(),
+        torch.from_numpy(SQUARE).bfloat16(),
+        torch.from_numpy(SQUARE.T.copy()).mT,
+    ],
+    ids=lambda mask: str(mask.dtype),
+)
+def test_masks_come_in_whatever_form_users_have(mask: Any) -> None:
+    expected = torch.from_numpy(SQUARE)
+    stacked = mask[None] if isinstance(mask, Tensor) else np.stack([mask])
+    for masks in ([mask], (mask,), stacked):
+        assert (MaskCrops.of(masks).dense() > 0.5).equal(expected[None])
+    some = MaskCrops.of([None, mask, None])
+    assert some.areas.tolist() == [0, 6, 0]
+    assert len(some.values) == 6
+
+
+def test_absent_masks_are_never_read() -> None:
+    masks = torch.full((2, 4, 6), torch.nan)
+    masks[0] = 0.0
+    crops = MaskCrops.of(masks, torch.tensor([True, False]))
+    assert crops.areas.tolist() == [0, 0]
+    assert not len(crops.values)
+
+
+def test_rows_where_joined_padded_and_moved() -> None:
+    masks = random_masks(5, torch.Generator().manual_seed(9)).nan_to_num(0.7)
+    crops = MaskCrops.of(masks)
+    index = torch.tensor([3, 0, 3])
+    assert crops.rows(index).dense().equal(masks[index])
+    present = torch.tensor([True, False, True, False, True])
+    assert crops.where(present).dense().equal(masks * present[:, None, None])
+    assert (
+        MaskCrops.joined([crops, crops.rows(index[:0]), crops.rows(index)])
+        .dense()
+        .equal(torch.cat([masks, masks[index]]))
+    )
+    padded = crops.padded((30, 40))
+    assert padded.dense().equal(torch.nn.functional.pad(masks, (0, 9, 0, 7)))
+    assert crops.to(torch.float64).values.dtype == torch.float64
+    assert MaskCrops.of(masks > 0.5).to(torch.float64).values.dtype == torch.bool
+    assert MaskCrops.none(3, (4, 6), masks).dense().equal(torch.zeros(3, 4, 6))
+    with pytest.raises(InputError, match=r"records: expected masks of images of one size, .*; pad them"):
+        MaskCrops.joined([crops, padded])
+
+
+def test_zeros_have_gradients_too() -> None:
+    mask = torch.zeros(1, 4, 6)
+    mask[0, 1, 2] = 0.8
+    mask.requires_grad_()
+    MaskCrops.of(mask).at(torch.tensor([0, 0]), torch.tensor([2, 5]), torch.tensor([1, 3])).sum().backward()
+    assert mask.grad is not None
+    assert mask.grad.nonzero().tolist() == [[0, 1, 2], [0, 3, 5]]
+
+
+@pytest.mark.parametrize("value", [1.6, 255.0, torch.inf])
+def test_more_than_a_probability_is_named(value: float) -> None:
+    masks = torch.zeros(3, 4, 6)
+    masks[1, 2, 3], masks[2, 1, 1] = value, torch.nan
+    got = f"got a value of {value:g} in mask 1; apply a sigmoid to logits, or divide by 255"
+    with pytest.raises(InputError, match=rf"^right: expected foreground probabilities in \[0, 1\], {got}"):
+        MaskCrops.of(masks, name="right")
+    assert MaskCrops.of(masks, torch.tensor([True, False, True])).areas.tolist() == [0, 0, 1]
+
+
+def test_masks_may_overshoot_by_resampling() -> None:
+    """What a mask head gives, brought to the image's size by cubic kernels."""
+    small = torch.zeros(1, 1, 14, 14)
+    small[..., 4:9, 3:12], small[..., 6, 6] = 1.0, 0.0
+    masks = torch.nn.functional.interpolate(small, size=(140, 210), mode="bicubic")[0]
+    assert masks.max() > 1.1
+    assert MaskCrops.of(masks).areas.tolist() == [int((masks > 0.5).sum())]
+
+
+@pytest.mark.parametrize(
+    ("masks", "text"),
+    [
+        (None, r"masks: expected masks \(B, H, W\), or B entries that are \(H, W\) or None, got NoneType"),
+        (torch.zeros(4, 6), r"masks: expected shape \(B, H, W\), got \(4, 6\)"),
+        ([torch.zeros(4, 6), torch.zeros(4, 5)], r"masks: expected masks of one size .*\(4, 5\), \(4, 6\)"),
+        ([None, None], r"masks: expected masks of one size .*; where no car has a mask give torch.zeros"),
+        (torch.zeros(1, 4, 6).long(), "masks: expected bool, or foreground probabilities .* got torch.int64"),
+        ([np.zeros((1, 4, 6))], r"masks\[0\]: expected shape \(H, W\), got \(1, 4, 6\)"),
+    ],
+)
+def test_what_is_no_mask_is_named(masks: Any, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        MaskCrops.of(masks)
+
+
+def test_boxes_must_hold_the_values() -> None:
+    crops = MaskCrops.of(torch.ones(1, 4, 6))
+    with pytest.raises(InputError, match=r"boxes: expected half open boxes within 6 x 4 pixels that have 24 pixels"):
+        replace(crops, boxes=torch.tensor([[0, 0, 6, 3]]))
+    with pytest.raises(InputError, match=r"boxes: expected half open boxes within 6 x 3"):
+        crops.padded((3, 6))
