@@ -44,7 +44,8 @@ class MaskMatches:
     right: list[InstanceMask | None]
     # For each object without a left mask the reason, else "".
     reasons: list[str]
-    # (B, 4) of the left image: the detector's 2D box, or that of the projected 3D box where there is none of use.
+    # (B, 4) of the left image: the detector's 2D box; where there is none of use that of the mask, else of the projected
+    # 3D box, and NaN where the image shows nothing of it.
     box_2d: NDArray[np.float64]
 
     def of_side(self, side: Side) -> list[InstanceMask | None]:
@@ -93,6 +94,9 @@ def match_masks(
     shift = projected["right"] - projected["left"]
     moved = [_moved(mask, dx) for mask, dx in zip(left, shift[:, [0, 2]].mean(axis=1), strict=True)]
     right, _ = matched("right", [hulls["right"], moved])
+    # Where the file has no box of use, that of the mask is nearest to what a 2D detector would have found.
+    rows = [row for row, mask in enumerate(left) if mask is not None and not has_box[row]]
+    box_2d[rows] = np.array([of.mask_box for row in rows if (of := left[row])]).reshape(-1, 4)
     return MaskMatches(left, right, reasons, box_2d)
 
 
