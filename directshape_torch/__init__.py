@@ -15,6 +15,7 @@ from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.ground_plane import GroundPlane
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.config_files import load_config
+from directshape_torch.masks import MaskCrops
 from directshape_torch.refinement.disparity_profile import DisparityProfile
 from directshape_torch.refinement.observability import Observability
 from directshape_torch.refinement.quality import FitQuality
@@ -53,6 +54,7 @@ __all__ = [
     "GroundPlane",
     "InputError",
     "KittiBoxes",
+    "MaskCrops",
     "MeshError",
     "MissingDependencyError",
     "Observability",

@@ -94,7 +94,23 @@ class MaskCrops(TensorRecord):
 
     @classmethod
     def of_boxes(cls, crops: Sequence[tuple[Sequence[int], Tensor]], size_hw: tuple[int, int], like: Tensor) -> Self:
-        """Crops made elsewhere: of each instance the box and the pixels (h, w) in it, in the dtype of `like`."""
+        """Masks that are known inside of boxes alone, as mask heads give them.
+
+        Args:
+            crops: of each instance the box u0, v0, u1, v1, half open, whole pixels within the image, and the mask
+                (v1 - v0, u1 - u0) in it; a box without an area for an instance without a mask.
+            size_hw: height and width of the images, pixels.
+            like: gives dtype and device.
+
+        Raises:
+            InputError: a box that leaves the image, or a mask of another size than its box.
+
+        Examples:
+            >>> head = torch.rand(1, 1, 28, 28)
+            >>> inside = torch.nn.functional.interpolate(head, size=(30, 80), mode="bilinear")[0, 0]
+            >>> MaskCrops.of_boxes([((100, 50, 180, 80), inside)], (120, 400), head).dense().shape
+            torch.Size([1, 120, 400])
+        """
         values = [pixels.reshape(-1).to(like) for _, pixels in crops]
         boxes = torch.tensor([list(box) for box, _ in crops], dtype=torch.int64, device=like.device)
         return cls(torch.cat(values) if values else like.new_zeros(0), boxes.reshape(-1, 4), size_hw)
