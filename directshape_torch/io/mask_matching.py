@@ -44,8 +44,8 @@ class MaskMatches:
     right: list[InstanceMask | None]
     # For each object without a left mask the reason, else "".
     reasons: list[str]
-    # (B, 4) of the left image: the detector's 2D box; where there is none of use that of the mask, else of the projected
-    # 3D box, and NaN where the image shows nothing of it.
+    # (B, 4) of the left image: the detector's 2D box; where there is none of use that of the mask, else that of the
+    # projected 3D box, and NaN where the image shows nothing of it.
     box_2d: NDArray[np.float64]
 
     def of_side(self, side: Side) -> list[InstanceMask | None]:
