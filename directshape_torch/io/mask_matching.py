@@ -48,10 +48,6 @@ class MaskMatches:
     # projected 3D box, and NaN where the image shows nothing of it.
     box_2d: NDArray[np.float64]
 
-    def of_side(self, side: Side) -> list[InstanceMask | None]:
-        """The masks in one image."""
-        return self.left if side == "left" else self.right
-
 
 def match_masks(
     objects: Sequence[KittiObject],
