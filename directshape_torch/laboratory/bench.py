@@ -19,10 +19,12 @@ from directshape_torch.refinement.problem import CarProblem, CarStage
 from directshape_torch.refinement.scene_problem import TermFactory, problem_of_scene
 from directshape_torch.refinement.tracks import in_tracks
 from directshape_torch.rows import PixelSamples, PointSamples, Rays, Rows
+from directshape_torch.scene import Detections
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.solver.sharing import Groups
 from directshape_torch.terms.cars import CarBatch, CarState, retract
+from directshape_torch.terms.check_term import car_products, check_same
 from directshape_torch.terms.depth import closest_of_march, first_hits, march
 from directshape_torch.terms.motion import MOTION_NAMES, timed
 from directshape_torch.terms.next_view import NEXT_VIEW_NAME
@@ -109,6 +111,8 @@ class Bench:
             if drawn.state.path.shape[1]:
                 problem = _of_a_track(problem, cars, drawn.state)
             stages.append(problem.begin(c.stages[regime.stage], problem.look(start)))
+        if own_terms:
+            _check_refused(config, prior, scene, detections, cars, seen, own_terms)
         terms = _named(*stages)
         sight = stages[0].problem.look(drawn.state)
         rows = {name: rows_at(term, sight) for name, term in terms.items()}
@@ -142,6 +146,34 @@ def _settings(regime: Regime, pixels_per_car: int) -> RefinerConfig:
     )
     cloud = replace(config.point_cloud, min_points=1)
     return replace(config, priors=priors, sampling=sampling, point_cloud=cloud)
+
+
+def _check_refused(
+    config: RefinerConfig,
+    prior: PCAShapePrior,
+    scene: LaboratoryScene,
+    detections: Detections,
+    cars: CarBatch,
+    seen: Observation,
+    own_terms: Sequence[TermFactory],
+) -> None:
+    """Raise `InputError` unless a user's terms say of cars, made without the first one, what they say beside it."""
+    keep = torch.arange(len(cars)) > 0
+    all_cars, few = (
+        problem_of_scene(config, prior, scene.frame, detections, cars.of_cars(kept), seen.of_objects(kept), own_terms)
+        for kept in (torch.ones_like(keep), keep)
+    )
+    for before, now in zip(all_cars.of_problems(keep).extra_terms, few.extra_terms, strict=True):
+        code = prior.initial_code(len(cars) - 1).to(cars.detector_T_cam_obj)
+        state = CarState.of(se3.inverse(cars.detector_T_cam_obj[keep]), code, cars.num_offsets)
+        sight = few.look(state)
+        stage = config.stages[0]
+        products = [
+            car_products(term, sight.field, state, term.where(sight))
+            for term in (before.begin(stage, sight), now.begin(stage, sight))
+        ]
+        called = f"extra term {now.names[0]!r} of the cars that were not refused"
+        check_same(called, products[1], products[0], range(len(cars) - 1))
 
 
 def _of_a_track(problem: CarProblem, cars: CarBatch, state: CarState) -> CarProblem:

@@ -70,6 +70,11 @@ class CarProblem:
         """Of the T columns of costs."""
         return tuple(name for term in self.terms for name in term.names)
 
+    @property
+    def extra_terms(self) -> tuple[Term, ...]:
+        """Those that are a user's own."""
+        return self.terms[len(self.terms) - self.num_extra :]
+
     def stages(self) -> list[StageConfig]:
         return method_stages(self.config)
 

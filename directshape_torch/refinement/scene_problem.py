@@ -18,6 +18,7 @@ from directshape_torch.observation.packing import Observation
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.rows import Rows
 from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.field import field_of
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.check_term import check_term
@@ -92,7 +93,7 @@ def _check_extra(problem: CarProblem, own: int, cars: CarBatch) -> None:
     sight = problem.look(CarState.of(se3.inverse(cars.detector_T_cam_obj), code, cars.num_offsets))
     names = [*MOTION_NAMES, NEXT_VIEW_NAME, *(name for term in problem.terms[:own] for name in term.names)]
     for term in problem.terms[own:]:
-        check_term(term, problem.stages()[0], sight, names)
+        check_term(term, problem.stages()[0], sight, names, lambda code: field_of(problem.prior.bind(code)))
         names += term.names
 
 

@@ -102,6 +102,7 @@ def following(initial: CarState, start: CarState) -> CarState:
 class CarBatch(Record):
     """What the terms know of B cars beside their pixels; fixed for a whole refinement."""
 
+    num_detections: int  # of the call, refused ones among them
     detection_row: Tensor  # (B,) row of each car among the detections of the call
     frame_index: Tensor  # (B,) frame of each car
     input_depth: Tensor  # (B,) metres
@@ -135,6 +136,7 @@ class CarBatch(Record):
             # The unknown offset stands for the field.
             field_sigma_px = field_sigma_px.masked_fill(offset_sigma_px > 0, 0.0)
         return cls(
+            num_detections=len(f),
             detection_row=torch.arange(len(f), device=f.device),
             frame_index=f,
             input_depth=detections.T_cam_obj[:, 2, 3],

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -11,22 +12,33 @@ from torch import Tensor
 from directshape_torch.config import StageConfig
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import check_shape
+from directshape_torch.numerics.gradient_mode import map_tensors
 from directshape_torch.rows import Blocks
-from directshape_torch.terms.term import Linear, Sight, Term, Where, linear_of
+from directshape_torch.shape.field import Field
+from directshape_torch.terms.cars import CarState
+from directshape_torch.terms.term import Linear, Sight, Term, Where, linear_of, part_of
 
 _OWN = ("names", "blocks", "block_weight", "information", "row_weight", "linear", "residual", "norm", "of_cars")
 _DEFAULTS = ("is_prior", "column", "begin", "moving", "where")
+# Of the largest entry of the matrices and gradients: above what rounding does, below what a centimetre does.
+_ROUNDING = 1e-4
+_LEAVING = "hand tensors of the cars to PriorTerm(values=...), or cut them in of_cars(keep, numbers)"
 
 
 @torch.no_grad()
-def check_term(term: Term, stage: StageConfig, sight: Sight, taken: Collection[str]) -> None:
+def check_term(
+    term: Term, stage: StageConfig, sight: Sight, taken: Collection[str], field_at: Callable[[Tensor], Field]
+) -> None:
     """Raise `InputError` unless all that a term gives at a state has the types and shapes that `Term` says.
+
+    The term is also evaluated as it is when cars have left: the cars that stay must say what they said before.
 
     Args:
         term: of B cars, no stage begun.
         stage: the first one.
         sight: what rays see at any state of these cars.
         taken: names of other terms.
+        field_at: the shapes of codes (B, K).
     """
     missing = [name for name in (*_OWN, *_DEFAULTS) if not _has(term, name)]
     if missing:
@@ -40,15 +52,66 @@ def check_term(term: Term, stage: StageConfig, sight: Sight, taken: Collection[s
     num_cars = len(sight.state.code)
     begun = term.begin(stage, sight)
     _check_rows(f"{called} after begin(...)", begun, num_cars)
-    _check_linear(f"{called}: linear(...)", begun, begun.where(sight), sight)
+    _check_linear(f"{called}: linear(...)", begun, begun.where(sight), sight.field, sight.state)
     moving, where, resting = begun.moving(sight, False)
     _check_rows(f"{called} after moving(...)", moving, num_cars)
-    _check_linear(f"{called} after moving(...): linear(...)", moving, where, sight)
+    _check_linear(f"{called} after moving(...): linear(...)", moving, where, sight.field, sight.state)
     check_shape(f"{called}: the cost of moving(...)", resting, (num_cars, len(names)), "one for each car and name")
-    if num_cars:
-        keep = torch.arange(num_cars, device=sight.state.code.device) > 0
-        part = moving.of_cars(keep, range(1, num_cars))
-        _check_rows(f"{called} after of_cars(...)", part, num_cars - 1)
+    before = car_products(moving, sight.field, sight.state, where)
+    # Every other car, one car, none: in the first two all numbers change.
+    for numbers in dict.fromkeys((tuple(range(1, num_cars, 2)), tuple(range(num_cars))[-1:], ())):
+        if len(numbers) < num_cars:
+            few = CarState(*(x[list(numbers)] for x in sight.state))
+            left = f"{called} after of_cars(...)"
+            now = _check_leaving(left, moving, where, few, field_at(few.code), numbers, num_cars)
+            check_same(left, now, before, numbers)
+
+
+def car_products(term: Term, field: Field, state: CarState, where: Where) -> Tensor:
+    """What a term adds to the systems of its cars (B, D + 1, D): the Gauss-Newton matrix, the gradient below it."""
+    products = part_of(term, linear_of(term, field, state, where), fisher=False).products
+    sums = products.new_zeros(len(state.code), *products.shape[1:])
+    return sums.index_add(0, term.blocks.owner, products * term.block_weight[:, None, None])
+
+
+def check_same(called: str, now: Tensor, before: Tensor, numbers: Sequence[int]) -> None:
+    """Raise `InputError` unless cars, `numbers` of all, add to their systems (B, D + 1, D) what they added before."""
+    if not numbers:
+        return
+    expected = before[list(numbers)]
+    limit = _ROUNDING * float(before.nan_to_num(posinf=0.0, neginf=0.0).abs().max())
+    same = torch.isclose(now, expected, rtol=0.0, atol=limit, equal_nan=True).all(dim=(1, 2))
+    if not same.all():
+        car = numbers[int((~same).nonzero()[0, 0])]
+        raise InputError(called, "the rows that each car had before", f"others of car {car}", _LEAVING)
+
+
+def _check_leaving(
+    called: str, term: Term, where: Where, few: CarState, field: Field, numbers: Sequence[int], num_cars: int
+) -> Tensor:
+    """What a few cars, `numbers` of all, add to their systems as an iteration asks for it when the others have left."""
+    keep = torch.zeros(num_cars, dtype=torch.bool, device=few.code.device)
+    keep[list(numbers)] = True
+    with _named(called, len(numbers)):
+        part = term.of_cars(keep, numbers)
+    _check_rows(called, part, len(numbers))
+    blocks = term.blocks.of_cars(keep, numbers)[1]
+    looks = (
+        where if isinstance(where, tuple) and not where else map_tensors(lambda x: x.index_select(-2, blocks), where)
+    )
+    _check_linear(f"{called}: linear(...)", part, looks, field, few)
+    return car_products(part, field, few, looks)
+
+
+@contextmanager
+def _named(called: str, num_cars: int) -> Iterator[None]:
+    """Name the term in errors of a user's own code: tensors of other cars do not fit the rows of these."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (RuntimeError, IndexError, TypeError, ValueError) as error:
+        raise InputError(called, f"values for {num_cars} cars", f"{type(error).__name__}: {error}", _LEAVING) from error
 
 
 def _has(term: Term, name: str) -> bool:
@@ -92,18 +155,20 @@ def _check_numbers(called: str, numbers: Tensor, count: int, of_what: str) -> No
         raise InputError(called, f"numbers of the {count} {of_what}", got, "number the cars of this batch from 0")
 
 
-def _check_linear(called: str, term: Term, where: Where, sight: Sight) -> None:
+def _check_linear(called: str, term: Term, where: Where, field: Field, state: CarState) -> None:
     """Factors of the Jacobian that fit the rows, and residuals and norms that fit them."""
-    at = term.linear(sight.field, sight.state, where)
+    with _named(called, len(state.code)):
+        at = term.linear(field, state, where)
     if not isinstance(at, Linear):
         raise InputError(called, "a Linear", type(at).__name__)
     of_rows = tuple(term.row_weight.shape)
-    check_shape(f"{called}.residual", at.residual, of_rows, "one for each block, row and residual")
+    check_shape(f"{called}.residual", at.residual, of_rows, f"one for each block, row and residual; {_LEAVING}")
     check_shape(f"{called}.J_residual_inner", at.J_residual_inner, of_rows, "by the row's inner scalar")
-    J = linear_of(term, sight.field, sight.state, where).J_inner_state
-    by_state = (*of_rows[:2], sight.state.num_unknowns)
+    J = linear_of(term, field, state, where).J_inner_state
+    by_state = (*of_rows[:2], state.num_unknowns)
     check_shape(f"{called}.J_inner_state", J, by_state, "by (v, omega, dcode), without the residual's axis")
-    again = term.residual(sight.field, sight.state, at.where)
+    with _named(called.replace("linear", "residual"), len(state.code)):
+        again = term.residual(field, state, at.where)
     check_shape(f"{called.replace('linear', 'residual')}", again, of_rows, "those of linear(...)")
     for name, values in term.norm(at.residual)._asdict().items():
         check_shape(f"{called.replace('linear', 'norm')}.{name}", values, of_rows, "one for each residual")

@@ -7,16 +7,18 @@ one's own is such a function in a `PriorTerm` (docs/extra_terms.md). Derivations
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from directshape_torch.config import PriorConfig
+from directshape_torch.errors import InputError, shown
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import viewing_axes
+from directshape_torch.numerics.checks import check_alike, check_shape
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.rows import Blocks
 from directshape_torch.shape.field import Field
@@ -38,15 +40,39 @@ class PriorResidual(NamedTuple):
 
 @dataclass(frozen=True)
 class PriorTerm(Term):
-    """`weight * sum_i r_i^2 / 2` of a residual of the state alone: one block of R rows for each car."""
+    """`weight * sum_i r_i^2 / 2` of a residual of the state alone: one block of R rows for each car.
+
+    Raises:
+        InputError: the weight is no number; a value is no tensor with a row for each detection of the call, or has
+            another device or, in floating point, another dtype than the cars.
+    """
 
     name: str  # of the term
     weight: float  # lambda
     cars: CarBatch  # constants of the cars
-    # the residual with its Jacobian, from the constants and a state
-    residual_of: Callable[[CarBatch, CarState], PriorResidual]
+    # The residual with its Jacobian, from the constants, a state and, by name, the rows (B, ...) of the values.
+    residual_of: Callable[..., PriorResidual]
     num_rows: int  # R
     is_prior: bool = True  # False for what belongs to the measurements
+    # What else the residual needs to know of each car: tensors (N, ...) of all N detections of the call.
+    values: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        called, depth = f"extra term {self.name!r}", self.cars.input_depth
+        if not isinstance(self.weight, (int, float)):
+            cure = f"give each car its own by refiner(..., term_weights={{{self.name!r}: (N,)}})"
+            raise InputError(f"{called}: weight", "a number", shown(self.weight), cure)
+        for name, value in self.values.items():
+            named = f"{called}: values[{name!r}]"
+            rest = getattr(value, "shape", ())[1:]
+            cure = "give the rows of all detections of the call in their order; those of the cars are found here"
+            check_shape(named, value, (self.cars.num_detections, *rest), cure)
+            check_alike(named, value, "the cars", depth if value.is_floating_point() else depth.to(value.dtype))
+
+    def _at(self, state: CarState) -> PriorResidual:
+        """The residual at a state, from the rows of the cars that are left."""
+        rows = self.cars.detection_row
+        return self.residual_of(self.cars, state, **{name: x.index_select(0, rows) for name, x in self.values.items()})
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -69,12 +95,12 @@ class PriorTerm(Term):
         return torch.ones_like(self.cars.input_depth, dtype=torch.float64).expand(self.num_rows, 1, -1).movedim(-1, 0)
 
     def linear(self, field: Field, state: CarState, where: Where) -> Linear:
-        at = self.residual_of(self.cars, state)
+        at = self._at(state)
         residual = at.residual.to(torch.float64)[..., None]
         return Linear(residual, torch.ones_like(residual), at.J_residual_state.to(torch.float64), where)
 
     def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
-        return self.residual_of(self.cars, state).residual.to(torch.float64)[..., None]
+        return self._at(state).residual.to(torch.float64)[..., None]
 
     def norm(self, residual: Tensor) -> robust.RobustValue:
         return robust.quadratic(residual)

@@ -15,4 +15,4 @@ def cars_on(normal: Tensor, offset: Tensor, count: int) -> CarBatch:
     nothing, number = torch.zeros(count, 0), torch.zeros(count, dtype=torch.long)
     ground = {"ground_normal_cam": normal.expand(count, 3), "ground_offset": offset.expand(count)}
     others = {f.name: nothing for f in fields(CarBatch) if f.name not in ground}
-    return CarBatch(**{**others, "detection_row": number, "frame_index": number}, **ground)
+    return CarBatch(**{**others, "num_detections": count, "detection_row": number, "frame_index": number}, **ground)

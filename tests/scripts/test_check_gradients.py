@@ -73,6 +73,30 @@ def test_a_term_of_ones_own(
     assert "extra term 'mine': linear(...).residual: expected shape (1, 3, 1), got (1, 1, 1)" in capsys.readouterr().err
 
 
+def test_a_term_of_ones_own_with_values_of_each_car(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Handed over as values they pass; rows counted from the first car are wrong as soon as a car is refused."""
+    (tmp_path / "a_term_with_values.py").write_text(
+        "from directshape_torch.terms.priors import PriorTerm, height_prior\n\n\n"
+        "def lower(cars, state, metres):\n    at = height_prior(cars, state)\n"
+        "    return at._replace(residual=at.residual - metres)\n\n\n"
+        "def right(frames, detections, cars, prior):\n"
+        "    return PriorTerm('mine', 2.0, cars, lower, 1, values={'metres': detections.T_cam_obj[:, :1, 3]})\n\n\n"
+        "def wrong(frames, detections, cars, prior):\n"
+        "    metres = detections.T_cam_obj[:, :1, 3]\n"
+        "    first = cars.detection_row - cars.detection_row.min() if len(cars) else cars.detection_row\n"
+        "    table = metres[first] if len(cars) else metres\n"
+        "    full = metres.new_zeros(len(metres), 1).index_copy(0, cars.detection_row, table[: len(cars)])\n"
+        "    return PriorTerm('mine', 2.0, cars, lower, 1, values={'metres': full})\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    quick = ["--regime", "typical", "--pixels", "8", "--no-second", "--states", "3"]
+    assert script.main([*quick, "--term", "a_term_with_values:right"]) == 0
+    assert script.main([*quick, "--term", "a_term_with_values:wrong"]) == 2
+    assert "extra term 'mine' of the cars that were not refused: expected the rows that each" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("option", "message"), [
     (["--term", "fotometric"], "term: expected one of silhouettes, .*photometric, .*got 'fotometric'"),
     (["--term", "no_such_module:f"], "--term: expected module:factory, got 'no_such_module:f'"),

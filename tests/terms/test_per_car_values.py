@@ -1,0 +1,224 @@
+"""What a user's term knows of each car goes with the cars that leave; mistakes are named before the first step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import pytest
+import torch
+from helpers.problems import DEFAULT
+from helpers.street_inputs import StreetInputs, with_mode
+from helpers.synthetic_scene import cached_street, disturbed, select
+from torch import Tensor
+
+from directshape_torch.config import RefinerConfig
+from directshape_torch.errors import InputError
+from directshape_torch.geometry import se3
+from directshape_torch.refinement.result import RefinementResult
+from directshape_torch.refinement.scene_problem import TermFactory
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.terms.priors import PriorResidual, PriorTerm
+
+COPIES = 3
+# Boxes of one car would hide each other.
+CONFIG = replace(DEFAULT, sampling=replace(DEFAULT.sampling, occlusion=False))
+WEIGHT = 2e5
+"""Pulls a car to its radar's position whatever the images say."""
+
+
+def to_radar(_: CarBatch, state: CarState, radar_cam: Tensor) -> PriorResidual:
+    """The object origin against a position (B, 3) in the camera frame, metres; the origin moves by -R_cam_obj v."""
+    T_cam_obj = se3.inverse(state.T_obj_cam)
+    J = torch.nn.functional.pad(-T_cam_obj[:, :3, :3], (0, 3 + state.code.shape[1]))
+    return PriorResidual(T_cam_obj[:, :3, 3] - radar_cam, J)
+
+
+def boxes(*order: int) -> Detections:
+    """Two cars, three disturbed boxes of each: they end in different iterations."""
+    found = cached_street()[1].detections
+    parts = [disturbed(found, 0.05 + 0.1 * n, 0.02 + 0.02 * n, seed=n) for n in range(COPIES)]
+    return select(Detections.joined(parts), torch.tensor(order or range(2 * COPIES)))
+
+
+def measured(detections: Detections) -> Tensor:
+    """A radar that is off by another distance for each box, known by its own position."""
+    at = detections.T_cam_obj[:, :3, 3]
+    return at + torch.stack([0.2 * torch.sin(40 * at[:, 2]), 0 * at[:, 0], 0.2 * torch.cos(40 * at[:, 2])], dim=-1)
+
+
+def radar(change: Callable[[Tensor], Any] = lambda x: x, weight: Any = WEIGHT, name: str = "radar_cam") -> TermFactory:
+    return lambda *scene: PriorTerm("radar", weight, scene[2], to_radar, 3, values={name: change(measured(scene[1]))})
+
+
+def closed_over(of_call: Callable[..., Tensor], change: Callable[[Tensor], Tensor] = lambda x: x) -> TermFactory:
+    """The radar as a residual that takes it from around itself, by a function of the table and the cars."""
+
+    def make(*scene: Any) -> PriorTerm:
+        table = change(measured(scene[1]))
+        return PriorTerm("radar", WEIGHT, scene[2], lambda c, s: to_radar(c, s, of_call(table, c)), 3)
+
+    return make
+
+
+def of_detections(table: Tensor, cars: CarBatch) -> Tensor:
+    return table[cars.detection_row]
+
+
+def refine(*extra: TermFactory, detections: Detections, config: RefinerConfig = CONFIG) -> RefinementResult:
+    prior, scene = cached_street(detections.T_cam_obj.dtype)
+    result: RefinementResult = DirectShapeRefiner(prior, config, extra)(scene.frames, detections)
+    return result
+
+
+@cache
+def together() -> RefinementResult:
+    """All boxes in one call; nobody changes it."""
+    return refine(radar(), detections=boxes())
+
+
+def test_cars_that_leave_take_their_values_along() -> None:
+    iterations = together().iterations
+    assert len(set(iterations.tolist())) > 1  # so cars left the batch while others stayed
+    assert together().refined.all()
+    distance = (together().T_cam_obj[:, :3, 3] - measured(boxes())).norm(dim=1)
+    assert float(distance.max()) < 0.02
+
+
+def test_a_car_ends_alike_alone_and_in_any_order() -> None:
+    order = (4, 1, 5, 0, 3, 2)
+    permuted = refine(radar(), detections=boxes(*order))
+    torch.testing.assert_close(permuted.T_cam_obj, together().T_cam_obj[list(order)], rtol=0, atol=1e-9)
+    for car in (0, 3):
+        alone = refine(radar(), detections=boxes(car))
+        torch.testing.assert_close(alone.T_cam_obj[0], together().T_cam_obj[car], rtol=0, atol=1e-9)
+
+
+def test_cars_that_are_refused_take_their_values_along() -> None:
+    detections = boxes()
+    behind = detections.T_cam_obj.clone()
+    behind[[0, 3], 2, 3] = -5.0
+    result = refine(radar(), detections=replace(detections, T_cam_obj=behind))
+    others = [1, 2, 4, 5]
+    assert not result.refined[[0, 3]].any()
+    torch.testing.assert_close(result.T_cam_obj[others], together().T_cam_obj[others], rtol=0, atol=1e-9)
+
+
+def test_no_car_at_all() -> None:
+    assert len(refine(radar(), detections=select(boxes(), torch.zeros(0, dtype=torch.long))).status) == 0
+
+
+def test_views_of_a_track_have_values_of_their_own() -> None:
+    """Two frames of one street, and a radar that sees its cars 3 cm to the left, then 3 cm to the right."""
+    prior, scene = cached_street()
+    frames, truth = FrameBatch.joined([scene.frames] * 2), scene.detections.T_cam_obj[:, :3, 3].repeat(2, 1)
+    found = truth + torch.tensor([-0.03, -0.03, 0.03, 0.03], dtype=truth.dtype)[:, None] * truth.new_tensor([1, 0, 0])
+    numbers = torch.tensor([0, 0, 1, 1]), torch.tensor([7, 8, 7, 8])
+    detections = replace(boxes(0, 1, 2, 3), frame_index=numbers[0], track_id=numbers[1])
+    result = DirectShapeRefiner(prior, CONFIG, [radar(lambda _: found)])(frames, detections)
+    torch.testing.assert_close(result.code[:2], result.code[2:])
+    assert float((result.T_cam_obj[:, :3, 3] - found).norm(dim=1).max()) < 0.01
+
+
+def test_gradients_reach_the_values() -> None:
+    inputs = StreetInputs()
+    detections = replace(inputs.detections, mask_left=inputs.mask)
+    metres = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    factories = radar(lambda x: x + metres), closed_over(of_detections, lambda x: x + metres)
+    refiners = [DirectShapeRefiner(inputs.prior, with_mode("unroll"), [make]) for make in factories]
+    heights = [refiner(inputs.scene.frames, detections).T_cam_obj[:, 1, 3].sum() for refiner in refiners]
+    gradient, by_closure = (float(torch.autograd.grad(height, metres)[0]) for height in heights)
+    assert gradient == pytest.approx(by_closure, rel=1e-9)
+    assert gradient > 1.0
+
+
+WRONG: dict[str, tuple[Callable[[Tensor], Any], str]] = {
+    "too few rows": (lambda x: x[:-1], r"expected shape \(6, 3\), got \(5, 3\); give the rows of all detections"),
+    "a transposed table": (lambda x: x.mT, r"expected shape \(6, 6\), got \(3, 6\); give the rows"),
+    "one number": (lambda x: x[0, 0], r"expected shape \(6,\), got \(\); give the rows of all detections"),
+    "an array": (
+        lambda x: x.numpy(),
+        r"expected a tensor of shape \(6, 3\), got ndarray; make one with torch.as_tensor",
+    ),
+    "nothing": (lambda _: None, r"expected a tensor of shape \(6,\), got NoneType"),
+    "another dtype": (
+        lambda x: x.float(),
+        r"expected the dtype of the cars \(torch.float64\), got torch.float32; move them together",
+    ),
+    "another device": (lambda x: x.to("meta"), "expected a tensor with numbers, got one on the device 'meta'"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_values_are_named(case: str) -> None:
+    change, message = WRONG[case]
+    with pytest.raises(InputError, match=r"^extra term 'radar': values\['radar_cam'\]: " + message):
+        refine(radar(change), detections=boxes())
+
+
+def test_values_by_names_that_the_residual_does_not_know_are_named() -> None:
+    with pytest.raises(InputError, match=r"^extra term 'radar'.*unexpected keyword argument 'rader_cam'"):
+        refine(radar(name="rader_cam"), detections=boxes())
+
+
+def test_a_weight_for_each_car_is_named() -> None:
+    with pytest.raises(InputError, match=r"^extra term 'radar': weight: expected a number, .*term_weights="):
+        refine(radar(weight=torch.ones(6)), detections=boxes())
+
+
+CLOSED: dict[str, Callable[..., Tensor]] = {
+    "all rows": lambda table, _: table,
+    "the first rows": lambda table, cars: table[: len(cars)],
+    "the last rows": lambda table, cars: table[len(table) - len(cars) :].flip(0),
+    "the mean of all cars": lambda table, cars: table[cars.detection_row].mean(dim=0),
+}
+LEAVING = r"hand tensors of the cars to PriorTerm\(values=...\)"
+
+
+@pytest.mark.parametrize("detections", [(0, 1), (0, 1, 2), (0, 1, 2, 3, 4, 5)], ids=len)
+@pytest.mark.parametrize("case", CLOSED)
+def test_a_residual_that_mistakes_the_cars_is_named_before_the_first_step(case: str, detections: Sequence[int]) -> None:
+    prior, scene = cached_street()
+    refiner = DirectShapeRefiner(prior, DEFAULT, [closed_over(CLOSED[case])])
+    with pytest.raises(InputError, match=rf"^extra term 'radar' after of_cars.*{LEAVING}"):
+        refiner.problem(scene.frames, boxes(*detections))
+
+
+def test_full_tables_are_named_where_cars_were_refused() -> None:
+    detections = boxes()
+    behind = detections.T_cam_obj.clone()
+    behind[0, 2, 3] = -5.0
+    with pytest.raises(InputError, match=rf"^extra term 'radar': linear.*expected values for 5 cars, got .*{LEAVING}"):
+        refine(closed_over(CLOSED["all rows"]), detections=replace(detections, T_cam_obj=behind))
+
+
+def test_rows_found_by_the_numbers_of_the_detections_are_right() -> None:
+    by_hand = refine(closed_over(of_detections), detections=boxes())
+    torch.testing.assert_close(by_hand.T_cam_obj, together().T_cam_obj, rtol=0, atol=1e-12)
+
+
+@dataclass(frozen=True)
+class Keeping(PriorTerm):
+    """A term whose own table of the cars is cut where the wrong cars leave."""
+
+    table: Tensor | None = None
+
+    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Keeping:
+        assert self.table is not None
+        return replace(self, cars=self.cars.of_cars(keep, numbers), table=self.table[: len(numbers)])
+
+    def _at(self, state: CarState) -> PriorResidual:
+        assert self.table is not None
+        return to_radar(self.cars, state, self.table)
+
+
+def test_a_table_cut_in_the_wrong_place_is_named() -> None:
+    message = r"after of_cars\(...\): expected the rows that each car had before, got others of car 1; hand"
+    with pytest.raises(InputError, match=message):
+        refine(
+            lambda *scene: Keeping("radar", WEIGHT, scene[2], to_radar, 3, table=measured(scene[1])), detections=boxes()
+        )
