@@ -21,7 +21,7 @@ from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarBatch, CarState
-from directshape_torch.terms.check_term import check_term
+from directshape_torch.terms.check_term import check_term, named_errors
 from directshape_torch.terms.motion import MOTION_NAMES
 from directshape_torch.terms.next_view import NEXT_VIEW_NAME
 from directshape_torch.terms.photometric import Photometric
@@ -75,7 +75,7 @@ def problem_of_scene(
         left = LeftPixels.of(pixels[0], sides[0], pyramid, observation.hidden_right, detections.mask_left)
         terms.append(Photometric(config.photometric, cars, left))
     terms += [] if config.method == "box_alignment" else prior_terms(config.priors, prior, cars)
-    own, extra = len(terms), [make(frames, detections, cars, prior) for make in extra_terms]
+    own, extra = len(terms), [_made(make, frames, detections, cars, prior) for make in extra_terms]
     terms += extra
     if not terms:
         raise ConfigError(f"method {config.method}: expected a term of weight above 0, got none: {_WEIGHTS}")
@@ -83,6 +83,14 @@ def problem_of_scene(
     _check_extra(problem, own, cars)
     factors = _factors(term_weights, problem.term_names, prior.initial_code(len(detections)).to(frames.images_left))
     return problem if factors is None else replace(problem, factors=factors[cars.detection_row])
+
+
+def _made(make: TermFactory, frames: FrameBatch, detections: Detections, cars: CarBatch, prior: ShapePrior) -> Term:
+    """A user's term; an error of the factory is named, for tensors of all detections do not fit those of the cars."""
+    called = f"extra term of {getattr(make, '__qualname__', type(make).__name__)}"
+    cure = "the cars are the rows cars.detection_row of the detections: take these rows of other tensors too"
+    with named_errors(called, len(cars), cure):
+        return make(frames, detections, cars, prior)
 
 
 def _check_extra(problem: CarProblem, own: int, cars: CarBatch) -> None:

@@ -92,7 +92,7 @@ def _check_leaving(
     """What a few cars, `numbers` of all, add to their systems as an iteration asks for it when the others have left."""
     keep = torch.zeros(num_cars, dtype=torch.bool, device=few.code.device)
     keep[list(numbers)] = True
-    with _named(called, len(numbers)):
+    with named_errors(called, len(numbers)):
         part = term.of_cars(keep, numbers)
     _check_rows(called, part, len(numbers))
     blocks = term.blocks.of_cars(keep, numbers)[1]
@@ -104,14 +104,14 @@ def _check_leaving(
 
 
 @contextmanager
-def _named(called: str, num_cars: int) -> Iterator[None]:
+def named_errors(called: str, num_cars: int, cure: str = _LEAVING) -> Iterator[None]:
     """Name the term in errors of a user's own code: tensors of other cars do not fit the rows of these."""
     try:
         yield
     except InputError:
         raise
     except (RuntimeError, IndexError, TypeError, ValueError) as error:
-        raise InputError(called, f"values for {num_cars} cars", f"{type(error).__name__}: {error}", _LEAVING) from error
+        raise InputError(called, f"values for {num_cars} cars", f"{type(error).__name__}: {error}", cure) from error
 
 
 def _has(term: Term, name: str) -> bool:
@@ -157,7 +157,7 @@ def _check_numbers(called: str, numbers: Tensor, count: int, of_what: str) -> No
 
 def _check_linear(called: str, term: Term, where: Where, field: Field, state: CarState) -> None:
     """Factors of the Jacobian that fit the rows, and residuals and norms that fit them."""
-    with _named(called, len(state.code)):
+    with named_errors(called, len(state.code)):
         at = term.linear(field, state, where)
     if not isinstance(at, Linear):
         raise InputError(called, "a Linear", type(at).__name__)
@@ -167,7 +167,7 @@ def _check_linear(called: str, term: Term, where: Where, field: Field, state: Ca
     J = linear_of(term, field, state, where).J_inner_state
     by_state = (*of_rows[:2], state.num_unknowns)
     check_shape(f"{called}.J_inner_state", J, by_state, "by (v, omega, dcode), without the residual's axis")
-    with _named(called.replace("linear", "residual"), len(state.code)):
+    with named_errors(called.replace("linear", "residual"), len(state.code)):
         again = term.residual(field, state, at.where)
     check_shape(f"{called.replace('linear', 'residual')}", again, of_rows, "those of linear(...)")
     for name, values in term.norm(at.residual)._asdict().items():

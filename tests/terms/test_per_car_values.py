@@ -196,6 +196,18 @@ def test_full_tables_are_named_where_cars_were_refused() -> None:
         refine(closed_over(CLOSED["all rows"]), detections=replace(detections, T_cam_obj=behind))
 
 
+def test_a_factory_that_mixes_detections_and_cars_is_named() -> None:
+    detections = boxes()
+    behind = detections.T_cam_obj.clone()
+    behind[0, 2, 3] = -5.0
+
+    def mixing(*scene: Any) -> PriorTerm:
+        return PriorTerm("radar", float((scene[1].T_cam_obj[:, 2, 3] / scene[2].input_depth).sum()), *scene[2:4], 1)
+
+    with pytest.raises(InputError, match=r"^extra term of .*mixing: expected values for 5 cars, .*cars.detection_row"):
+        refine(mixing, detections=replace(detections, T_cam_obj=behind))
+
+
 def test_rows_found_by_the_numbers_of_the_detections_are_right() -> None:
     by_hand = refine(closed_over(of_detections), detections=boxes())
     torch.testing.assert_close(by_hand.T_cam_obj, together().T_cam_obj, rtol=0, atol=1e-12)
