@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import sys
 from dataclasses import replace
 from functools import lru_cache
@@ -26,6 +27,7 @@ from directshape_torch import (
     StereoCamera,
 )
 from directshape_torch.geometry.box_formats import poses_to_boxes
+from directshape_torch.status import Status
 
 PRIOR, STREET = cached_street()
 
@@ -241,12 +243,27 @@ def test_meshes_of_all_cars(monkeypatch: pytest.MonkeyPatch) -> None:
         result.meshes("blender")  # type: ignore[arg-type]
 
 
-def test_a_result_prints_itself_in_ten_lines() -> None:
+def test_a_result_prints_all_of_its_cars() -> None:
     result = refined()
-    many = result[[0, 1] * 8]
-    lines = repr(many).splitlines()
+    lines = repr(result[[0, 1] * 8]).splitlines()
     assert lines[0] == "RefinementResult of 16 cars (torch.float64, cpu)"
-    assert lines[-1] == "  and 10 more"
-    assert len(lines) == 10
-    assert "converged" in lines[1]
+    assert "8 converged" in lines[1]
+    assert [int(line.split()[0]) for line in lines[3:]] == list(range(16))
     assert repr(result[:0]).splitlines()[1:] == ["  no cars"]
+
+
+def test_a_result_of_many_cars_prints_those_that_need_a_look() -> None:
+    """Car 90 has no mask, car 70 is doubtful; the first 38 of the others fill the table."""
+    result = refined()[[0, 1] * 50]
+    result.status_code[90] = Status.no_mask.code
+    result.quality.probability_better[:] = 0.9
+    result.quality.probability_better[70] = 0.4
+    lines = repr(result).splitlines()
+    assert sum(map(int, re.findall(r"\d+", lines[1]))) == 100
+    assert lines[2] == f"  no_mask: {Status.no_mask.value}"
+    assert [int(line.split()[0]) for line in lines[4:-1]] == [*range(38), 70, 90]
+    assert lines[-1].startswith("  60 more cars are not shown, all refined, none doubtful (better below 0.5)")
+    result.quality.probability_better[:] = 0.4
+    assert "60 more cars are not shown, 60 of them not refined or doubtful" in repr(result).splitlines()[-1]
+    result.quality.probability_better[:] = float("nan")
+    assert "all refined, none doubtful" in repr(result).splitlines()[-1]

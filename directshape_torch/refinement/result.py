@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 
 Frame = Literal["ref", "cam"]
-# Cars that a result names when it is printed.
-_PRINTED_CARS = 6
+# Cars that a result shows when it is printed, and the probability to have got better below which one is doubtful.
+_PRINTED_CARS, _DOUBTFUL_BELOW = 40, 0.5
 
 
 @dataclass(frozen=True)
@@ -188,24 +188,40 @@ class RefinementResult(CarRecord):
         return result
 
     def __repr__(self) -> str:
-        """Statuses, and the first cars in a table."""
-        counts = Counter(status.name for status in self.status).most_common()
-        lines = [
-            f"RefinementResult of {len(self)} cars ({self.T_cam_obj.dtype}, {self.T_cam_obj.device})",
-            f"  {', '.join(f'{count} {name}' for name, count in counts) or 'no cars'}",
-        ]
-        head = self.detach()[:_PRINTED_CARS].cpu()
-        if len(head):
-            lines.append("  car      x      y      z  heading  length  mask IoU  better  status")
-        boxes, quality = head.to_boxes("kitti").tolist(), head.quality
-        for row, (x, y, z, _, _, length, heading) in enumerate(boxes):
-            iou, better = float(quality.mask_iou_left[row]), float(quality.probability_better[row])
+        """Counts of the statuses, what those of cars that were not refined mean, and a table of up to 40 cars.
+
+        Of more cars those that were not refined, or got better with a probability below 0.5, come before all others.
+        """
+        lines = [f"RefinementResult of {len(self)} cars ({self.T_cam_obj.dtype}, {self.T_cam_obj.device})"]
+        counts = Counter(self.status).most_common()
+        lines.append(f"  {', '.join(f'{count} {status.name}' for status, count in counts) or 'no cars'}")
+        lines += [f"  {status.name}: {status.value}" for status, _ in counts if not status.is_refined]
+        if not len(self):
+            return lines[0] + "\n" + lines[1]
+        shown, left_out = self._printed_rows()
+        lines.append("  car      x      y      z  heading  length  mask IoU  better  status")
+        chosen = self.detach()[shown].cpu()
+        boxes, quality = chosen.to_boxes("kitti").tolist(), chosen.quality
+        for place, (row, (x, y, z, _, _, length, heading)) in enumerate(zip(shown.tolist(), boxes, strict=True)):
+            iou, better = float(quality.mask_iou_left[place]), float(quality.probability_better[place])
             lines.append(
                 f"  {row:3d} {x:6.2f} {y:6.2f} {z:6.2f} {heading:8.2f} {length:7.2f} {iou:9.2f} {better:7.2f}  "
-                f"{head.status[row].name}"
+                f"{chosen.status[place].name}"
             )
-        more = len(self) - len(head)
-        return "\n".join([*lines, f"  and {more} more"] if more else lines)
+        return "\n".join(lines + left_out)
+
+    def _printed_rows(self) -> tuple[Tensor, list[str]]:
+        """The cars (N,) that a print shows, and a sentence on those that it leaves out, where it leaves out any."""
+        doubtful = (~self.refined | (self.quality.probability_better.detach() < _DOUBTFUL_BELOW)).cpu()
+        # A stable order: the doubtful ones first, each in the order of the detections.
+        order = torch.argsort(~doubtful, stable=True)
+        shown = order[:_PRINTED_CARS].sort().values
+        left_out, num_doubtful = len(self) - len(shown), int(doubtful.sum()) - int(doubtful[shown].sum())
+        if not left_out:
+            return shown, []
+        kinds = f"{num_doubtful} of them not refined or doubtful" if num_doubtful else "all refined, none doubtful"
+        words = f"{left_out} more cars are not shown, {kinds} (better below {_DOUBTFUL_BELOW})"
+        return shown, [f"  {words}; result[rows] shows others"]
 
     @property
     def status(self) -> list[Status]:
