@@ -53,15 +53,15 @@ class View:
     from_image: Array = field(default_factory=lambda: np.eye(3))  # (3, 3) from the whole image's pixels to these
 
     @classmethod
-    def of_frame(cls, frame: FrameBatch, side: Side = "left") -> View:
-        """An image of a batch of one frame, by the pinhole model."""
-        camera = frame.camera
+    def of_frame(cls, frames: FrameBatch, side: Side = "left", number: int = 0) -> View:
+        """An image of one frame of a batch without its padding, by the pinhole model."""
+        camera, (height, width) = frames.camera, frames.sizes[number].tolist()
         images, K, T = (
-            (frame.images_left, camera.K_left, np.eye(4))
+            (frames.images_left, camera.K_left, np.eye(4))
             if side == "left"
-            else (frame.images_right, camera.K_right, camera.T_right_cam[0].double().cpu().numpy())
+            else (frames.images_right, camera.K_right, camera.T_right_cam[number].detach().double().cpu().numpy())
         )
-        return cls(rgb8(images[0]), K[0].double().cpu().numpy() @ T[:3])
+        return cls(rgb8(images[number, :, :height, :width]), K[number].detach().double().cpu().numpy() @ T[:3])
 
     @property
     def K(self) -> Array:

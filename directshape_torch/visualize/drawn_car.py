@@ -16,6 +16,7 @@ from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.kitti_labels import KittiObject, box_corners_cam, poses_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refinement.result import RefinementResult
+from directshape_torch.scene import Detections
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.shape.zero_level import sdf_to_mesh
 from directshape_torch.status import Status
@@ -33,7 +34,7 @@ class DrawnCar:
     corners_cam: Array  # (8, 3) of its box, in the order of `box_corners`, metres
     code: Array  # (K,) of the shape
     mesh: trimesh.Trimesh | None  # the shape in its object frame, or None where no prior is at hand
-    line: int  # of the detection file
+    line: int  # of the detection file, or row of the call
     status: str | None = None  # how its refinement ended; None before it
 
     @property
@@ -67,6 +68,20 @@ def drawn_cars(loaded: LoadedFrame, result: RefinementResult) -> tuple[list[Draw
     objects, t_cam_ref = loaded.detected_objects, loaded.frame.camera.t_cam_ref[0]
     before = cars_before(objects, t_cam_ref, mean_car(result.prior), result.code.shape[1])
     return before, cars_of_result(result, [one.line_number for one in objects], before)
+
+
+def cars_of_tensors(
+    detections: Detections,
+    result: RefinementResult,
+    cars: Tensor,  # (M,) rows of both
+) -> tuple[list[DrawnCar], list[DrawnCar]]:
+    """Some cars of a call before and after, numbered by their rows; their detected boxes must be finite."""
+    chosen, mean = detections.rows(cars), mean_car(result.prior)
+    T_cam_obj, hwl = (x.detach().double().cpu() for x in (chosen.T_cam_obj, chosen.dimensions_hwl))
+    code, rows = np.zeros(result.code.shape[1]), cars.tolist()
+    boxes = np.asarray(box_corners(T_cam_obj, hwl))
+    before = [DrawnCar(T, box, code, mean, row) for T, box, row in zip(T_cam_obj.numpy(), boxes, rows, strict=True)]
+    return before, cars_of_result(result.rows(cars), rows, before)
 
 
 def cars_of_result(

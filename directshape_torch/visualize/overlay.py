@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from numbers import Integral
 
 import numpy as np
 
+from directshape_torch.errors import InputError, shown
 from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.numerics.checks import check_type
 from directshape_torch.refinement.result import RefinementResult
+from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.visualize.drawing import (
     BLUE,
     GREEN,
@@ -28,7 +32,7 @@ from directshape_torch.visualize.drawing import (
     draw_text,
     titled,
 )
-from directshape_torch.visualize.drawn_car import DrawnCar, drawn_cars, true_corners
+from directshape_torch.visualize.drawn_car import DrawnCar, cars_of_tensors, drawn_cars, true_corners
 
 _LEAST_WIDTH_PX = 1000
 _BIRDS_EYE_WIDTH_PX = 560
@@ -36,6 +40,51 @@ _BIRDS_EYE_WIDTH_PX = 560
 _TALL_PX = 60
 _TILES_A_ROW = (4, 7)
 _CAMERA = np.array([[0.0, 0.0, 0.0], [-0.6, 0.0, 1.2], [0.6, 0.0, 1.2]])
+
+
+def overlay(frames: FrameBatch, detections: Detections, result: RefinementResult, frame: int = 0) -> Picture:
+    """The picture of one frame of a call before and after its refinement, from the tensors of the call.
+
+    It shows what `refine --overlays` draws of files: contours and boxes in the left image, each car enlarged, and all
+    cars from above. Cars have the numbers of their rows in the call, as in `print(result)`; those that were not refined
+    are grey, and one whose detected box is not finite is left out.
+
+    Args:
+        frames: what the refiner was given, F frames.
+        detections: what the refiner was given, N cars.
+        result: what the refiner gave back, N cars.
+        frame: which of the F frames.
+
+    Returns:
+        (h, w, 3) RGB, uint8, at least 1000 pixels wide for the image and 560 for the view from above.
+
+    Raises:
+        InputError: other types, another number of cars in `result` than in `detections`, or no such frame.
+
+    Examples:
+        >>> import torch
+        >>> import directshape_torch as ds
+        >>> K = torch.tensor([[700.0, 0.0, 200.0], [0.0, 700.0, 60.0], [0.0, 0.0, 1.0]])
+        >>> image, mask = torch.zeros(3, 120, 400), torch.zeros(1, 120, 400, dtype=torch.bool)
+        >>> frames = FrameBatch.from_images(image, image, ds.StereoCamera.from_intrinsics(K, 0.54))
+        >>> boxes = torch.tensor([[0.0, 1.6, 15.0, 1.5, 1.7, 4.0, -1.57]])
+        >>> detections = Detections.from_boxes(boxes, "kitti", mask_left=mask)
+        >>> picture = overlay(frames, detections, ds.DirectShapeRefiner()(frames, detections))
+        >>> picture.shape[2], picture.dtype
+        (3, dtype('uint8'))
+    """
+    check_type("frames", frames, (FrameBatch,))
+    check_type("detections", detections, (Detections,))
+    check_type("result", result, (RefinementResult,))
+    if len(result) != len(detections):
+        raise InputError("result", f"that of the {len(detections)} detections", f"{len(result)} cars")
+    if not (isinstance(frame, Integral) and 0 <= frame < len(frames)):
+        raise InputError("frame", f"a number of 0..{len(frames) - 1}", shown(frame))
+    drawable = detections.T_cam_obj.isfinite().flatten(1).all(dim=1) & detections.dimensions_hwl.isfinite().all(dim=1)
+    cars = ((detections.frame_index == frame) & drawable.to(detections.frame_index.device)).nonzero().flatten().cpu()
+    before, after = cars_of_tensors(detections, result, cars)
+    view = View.of_frame(frames, number=int(frame))
+    return overlay_picture(view, before, after, title=f"frame {frames.frame_ids[frame]}")
 
 
 def overlay_of_frame(loaded: LoadedFrame, result: RefinementResult) -> Picture:

@@ -37,6 +37,7 @@ from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.pca_fit import fit_pca
 from directshape_torch.shape.prior_file import PriorProvenance
 from directshape_torch.terms.lidar import LidarPoints
+from directshape_torch.visualize.overlay import overlay
 
 QUICK = ("stages=[{contour_width_px: 0.5, image_level: 0, max_iterations: 1}]", "method=combined")
 Place = tuple[str, ...]
@@ -180,6 +181,10 @@ def calls() -> dict[str, Call]:
         "overrides": Call({"path": None, "overrides": ["method=direct"]}, lambda a: [_number(load_config(**a))]),
         "prior file": Call({"source": "pca"}, lambda a: [torch.tensor(load_prior(**a).num_codes)]),
         "field file": Call({"path": Path("none.json")}, lambda a: [load_field(a["path"]).coefficients]),
+        "overlay": Call(
+            street | {"frame": 0},
+            lambda a: [torch.from_numpy(overlay(a["frames"], a["detections"], _result(), a["frame"]))],
+        ),
         "mesh": Call({"index": 0}, lambda a: [torch.from_numpy(_result().mesh(a["index"]).vertices)]),
     }
 

@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 import trimesh
+from helpers.synthetic_scene import cached_street, disturbed, joined_frames
 
+import directshape_torch
+from directshape_torch import (
+    Detections,
+    DirectShapeRefiner,
+    FrameBatch,
+    InputError,
+    RefinementResult,
+    load_config,
+)
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
+from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Array, Picture, View
 from directshape_torch.visualize.drawn_car import DrawnCar
-from directshape_torch.visualize.overlay import draw_footprint, ground_view, overlay_picture
+from directshape_torch.visualize.overlay import draw_footprint, ground_view, overlay, overlay_of_frame, overlay_picture
 
 P = np.array([[700.0, 0.0, 500.0, 0.0], [0.0, 700.0, 150.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
 # Two triangles a face would do as well for pictures: the outline is that of the convex hull.
@@ -76,3 +90,69 @@ def test_far_truth_is_left_out_of_the_scale() -> None:
     with_far = overlay_picture(image(), [car(0, 12, status=None)], [car(0, 12)], [corners(0, 150)])
     # Below the legend nothing moves.
     np.testing.assert_array_equal(with_far[150:], plain[150:])
+
+
+def call_of_two_frames() -> tuple[FrameBatch, Detections, RefinementResult]:
+    """The street twice, its second car in the second frame; the first one has no masks and is not refined."""
+    prior, street = cached_street()
+    d = disturbed(street.detections)
+    seen = torch.tensor([False, True])
+    detections = replace(d, frame_index=torch.tensor([0, 1]), has_mask_left=seen, has_mask_right=seen)
+    frames = joined_frames([street.frames, street.frames])
+    result = DirectShapeRefiner(prior, load_config("fast"))(frames, detections)
+    # Grey images would hide grey lines.
+    return replace(frames, images_left=torch.zeros_like(frames.images_left)), detections, result
+
+
+def test_tensors_of_a_call_are_drawn_where_their_cars_are() -> None:
+    frames, detections, result = call_of_two_frames()
+    height, width = frames.sizes[0].tolist()
+    enlarged = 1000 / width
+    rows = round(enlarged * height)
+    for frame, colour, other in ((0, GREY, BLUE), (1, BLUE, GREY)):
+        picture = overlay(frames, detections, result, frame)
+        assert picture.dtype == np.uint8
+        assert picture.shape[1:] == (1000 + 560, 3)
+        # Below the title; 6 pixels are between the rows.
+        before, after = picture[40:rows, :1000], picture[rows + 46 : 2 * rows + 6, :1000]
+        assert has_colour(before, ORANGE)
+        assert has_colour(after, colour)
+        assert not has_colour(after, other)
+        uv = View.of_frame(frames, number=frame).project(result.corners()[frame].numpy())
+        v, u = np.nonzero(np.abs(after.astype(int) - colour).max(axis=-1) < 30)
+        left, right = uv[:, 0].min() * enlarged, uv[:, 0].max() * enlarged
+        assert left - 3 <= u.min() <= left + 5
+        assert right - 5 <= u.max() <= right + 3
+        assert v.max() + 40 <= uv[:, 1].max() * enlarged + 3
+
+
+def test_tensors_and_files_give_the_same_picture() -> None:
+    """But for the line numbers of the file, which are those of the rows here, and the truth from above."""
+    root = Path(directshape_torch.__file__).parent / "assets" / "demo"
+    dataset = open_dataset("kitti", root, root / "detections" / "noisy_stereo", root / "training" / "masks")
+    loaded = dataset.load("000000")
+    numbers = dict(zip(loaded.row_of_detection, range(len(loaded.detections)), strict=True))
+    objects = [replace(one, line_number=numbers.get(row, 99)) for row, one in enumerate(loaded.input_objects)]
+    loaded = replace(loaded, input_objects=tuple(objects), labels=None)
+    result = DirectShapeRefiner(config=load_config("fast"))(loaded.frame, loaded.detections)
+    picture = overlay(loaded.frame, loaded.detections, result)
+    assert (np.abs(picture.astype(int) - overlay_of_frame(loaded, result)).max(axis=-1) > 40).mean() < 2e-4
+
+
+def test_a_frame_without_cars_and_a_box_that_is_not_finite() -> None:
+    frames, detections, result = call_of_two_frames()
+    T_cam_obj = detections.T_cam_obj.clone()
+    T_cam_obj[0] = torch.nan
+    for given in (replace(detections, T_cam_obj=T_cam_obj), replace(detections, frame_index=torch.tensor([1, 1]))):
+        assert not has_colour(overlay(frames, given, result)[40:240, :1000], ORANGE)
+
+
+def test_what_does_not_belong_together_is_refused() -> None:
+    frames, detections, result = call_of_two_frames()
+    with pytest.raises(InputError, match="result: expected that of the 2 detections, got 1 cars"):
+        overlay(frames, detections, result[:1])
+    for frame in (2, -1, 0.5, "000000"):
+        with pytest.raises(InputError, match=r"frame: expected a number of 0\.\.1"):
+            overlay(frames, detections, result, frame)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="detections: expected a Detections, got RefinementResult"):
+        overlay(frames, result, detections)  # type: ignore[arg-type]
