@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Mapping
 from pathlib import Path
 
 _LONGEST_MESSAGE = 2000
@@ -51,6 +52,21 @@ class MeshError(DirectShapeError, ValueError):
     """A mesh cannot be made solid, or a field has no surface."""
 
 
+class UnlikelyMeshError(MeshError):
+    """A mesh does not look like a car by the axes and unit that it is said to have.
+
+    Attributes:
+        found: which mesh, what was measured, and what it looks like.
+        cure: fields of `MeshOptions` by which it would look like a car; empty where none would.
+    """
+
+    def __init__(self, found: str, cure: Mapping[str, str | float]) -> None:
+        options = ", ".join(f"{name}={value!r}" for name, value in cure.items())
+        needs = f"it needs MeshOptions({options}), or " if cure else ""
+        super().__init__(f"{found}; {needs}MeshOptions(are_cars=False) if it is of another class")
+        self.found, self.cure = found, dict(cure)
+
+
 class ResumeError(DirectShapeError):
     """An output folder was made by another configuration, prior or input than the present run."""
 
@@ -61,6 +77,10 @@ class RunInProgressError(DirectShapeError):
 
 class SceneWarning(UserWarning):
     """What a refiner found wrong with images, calibration, masks or boxes (setting `check`)."""
+
+
+class PriorWarning(UserWarning):
+    """The mean shape of a prior's file does not look like a car, though the file does not say that it is none."""
 
 
 class NoGradientWarning(UserWarning):

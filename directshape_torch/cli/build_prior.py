@@ -1,21 +1,25 @@
 """`directshape build-prior`: make a shape prior from a folder of car meshes.
 
-Make meshes solid, sample their signed distance and keep the principal components. Writes the prior and a report (.json)
-beside it.
+Leave out meshes that do not look like cars by the given axes and scale, make the others solid, sample their signed
+distance and keep the principal components. Writes the prior and a report (.json) beside it.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections import Counter
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from directshape_torch.errors import DataFormatError, InputError, MeshError
+from directshape_torch.errors import DataFormatError, InputError, MeshError, UnlikelyMeshError
 from directshape_torch.files import atomic_files
 from directshape_torch.files.mesh_files import MESH_SUFFIXES
 from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
@@ -24,6 +28,8 @@ from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.prior_file import PriorProvenance
 
 REPORT_SCHEMA = "directshape_torch.prior_report/1"
+# Of anything that drives or walks.
+_LARGEST_M = 30.0
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -43,6 +49,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--scale", type=float, default=1.0, help="metres per unit of the files (default: %(default)s)")
     parser.add_argument("--length", type=float, metavar="M", help="scale every car to this length")
+    parser.add_argument(
+        "--not-cars",
+        action="store_true",
+        help="the meshes are of another class (trucks, people): do not compare them with cars",
+    )
     parser.add_argument("--closing", type=float, default=0.2, metavar="M", help="closes gaps up to twice this wide")
     parser.add_argument("--voxel", type=float, default=0.025, metavar="M", help="fine voxels (default: %(default)s)")
     parser.add_argument("--no-symmetry", action="store_true", help="do not average left and right")
@@ -66,27 +77,63 @@ def run(args: argparse.Namespace) -> int:
         symmetrise=not args.no_symmetry,
         voxel_m=args.voxel,
         closing_m=args.closing,
+        are_cars=not args.not_cars,
     )
-    grid = GridSpec.for_cars(args.spacing)
     files = _find_meshes(args.meshes, args.pattern)
     _check_enough(len(files), {}, args.num_codes)
+    grid = GridSpec.for_cars(args.spacing) if options.are_cars else _grid_around(files, args.spacing, options)
     grids, skipped = _read_meshes(files, args.meshes, grid, options)
     _check_enough(len(grids), skipped, args.num_codes)
     samples = torch.stack(list(grids.values()))
-    provenance = PriorProvenance("directshape build-prior", args.licence, len(grids), ", ".join(grids))
+    made_by, names = "directshape build-prior", ", ".join(grids)
+    provenance = PriorProvenance(made_by, args.licence, len(grids), names, of_cars=options.are_cars)
     prior = fit_pca(samples, torch.tensor(grid.origin), grid.spacing_m, args.num_codes, provenance)
     prior.save(args.out)
-    report = _report(prior, samples, tuple(grids), skipped)
+    reasons = {name: _in_options(x).removeprefix(f"{args.meshes / name}: ") for name, x in skipped.items()}
+    report = _report(prior, samples, tuple(grids), reasons)
     atomic_files.write_json(args.out.with_suffix(".json"), report)
     print(_report_text(args.out, report))
     return 3 if skipped else 0
 
 
-def _check_enough(num_usable: int, skipped: dict[str, str], num_codes: int) -> None:
-    if num_usable <= num_codes:
-        reasons = f" ({len(skipped)} skipped: {'; '.join(skipped.values())})" if skipped else ""
-        expected = f"more than --num-codes = {num_codes} usable meshes"
-        raise InputError("--meshes", expected, f"{num_usable}{reasons}", "add meshes or lower --num-codes")
+def _check_enough(num_usable: int, skipped: Mapping[str, Exception], num_codes: int) -> None:
+    if num_usable > num_codes:
+        return
+    expected = f"more than --num-codes = {num_codes} usable meshes"
+    cures = Counter(_options(x.cure) for x in skipped.values() if isinstance(x, UnlikelyMeshError) and x.cure)
+    cure = "add meshes or lower --num-codes"
+    if cures:
+        cure = "; ".join(f"{count} of them look like cars with {options}" for options, count in cures.most_common(3))
+    reasons = [_in_options(problem) for problem in skipped.values()]
+    several = f"{len(skipped)} skipped: {'; '.join(reasons)}"
+    first = f"{len(skipped)} skipped, the first: {reasons[0]}" if len(reasons) > 1 and cures else several
+    raise InputError("--meshes", expected, f"{num_usable}{f' ({first})' if skipped else ''}", cure)
+
+
+def _in_options(problem: Exception) -> str:
+    """What is wrong with a mesh, and the cure in options of this command."""
+    if not isinstance(problem, UnlikelyMeshError):
+        return str(problem)
+    needs = f"it needs {_options(problem.cure)}, or " if problem.cure else ""
+    return f"{problem.found}; {needs}--not-cars if it is of another class"
+
+
+def _options(fields: Mapping[str, str | float]) -> str:
+    """Fields of `MeshOptions` as options of this command."""
+    return " ".join(f"--{name.removesuffix('_m').replace('_', '-')}={value}" for name, value in fields.items())
+
+
+def _grid_around(files: list[Path], spacing_m: float, options: MeshOptions) -> GridSpec:
+    """A grid with room for all meshes; one that cannot be read, or is larger than any vehicle, is refused later."""
+    corners = []
+    for file in files:
+        with suppress(DataFormatError, MeshError):
+            corners.append(load_mesh_obj(file, options).bounds)
+    fitting = [both for both in corners if np.ptp(both, axis=0).max() <= _LARGEST_M]
+    if not fitting:
+        raise InputError("--scale", f"meshes of at most {_LARGEST_M:g} m", f"none of {len(files)}", "give their unit")
+    low_high = np.array(fitting)
+    return GridSpec.around(low_high[:, 0].min(axis=0), low_high[:, 1].max(axis=0), spacing_m)
 
 
 def _find_meshes(folder: Path, pattern: str) -> list[Path]:
@@ -101,16 +148,16 @@ def _find_meshes(folder: Path, pattern: str) -> list[Path]:
 
 def _read_meshes(
     files: list[Path], folder: Path, grid: GridSpec, options: MeshOptions
-) -> tuple[dict[str, Tensor], dict[str, str]]:
+) -> tuple[dict[str, Tensor], dict[str, Exception]]:
     """Signed distance grids by file name, and why the others were skipped."""
     grids: dict[str, Tensor] = {}
-    skipped: dict[str, str] = {}
+    skipped: dict[str, Exception] = {}
     for file in tqdm(files, desc="meshes", unit="mesh"):
         name = str(file.relative_to(folder))
         try:
             grids[name] = torch.from_numpy(mesh_to_sdf(load_mesh_obj(file, options), grid, options, name))
         except (DataFormatError, MeshError) as problem:
-            skipped[name] = str(problem)
+            skipped[name] = problem
     return grids, skipped
 
 

@@ -8,12 +8,14 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TextIO
 
 from directshape_torch.batch.refine_dataset import package_version
-from directshape_torch.errors import DirectShapeError
+from directshape_torch.errors import DirectShapeError, PriorWarning
 from directshape_torch.files.atomic_files import check_file
 
 EXIT_WRONG_INPUT = 2
@@ -61,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name in ("html", "json", "csv"):
             if isinstance(path := getattr(args, name, None), Path) and str(path) != "-":
                 check_file(f"--{name}", path)
-        with _terminable():
+        with _terminable(), _plain_warnings():
             code: int = args.run(args)
         sys.stdout.flush()
     except (DirectShapeError, OSError) as error:
@@ -98,6 +100,29 @@ def _terminable() -> Iterator[None]:
     finally:
         if is_ours:
             signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Show the warnings about priors in a line, without a place in the code, as errors are shown."""
+    with warnings.catch_warnings():
+        otherwise = warnings.showwarning
+
+        def show(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if issubclass(category, PriorWarning):
+                print(f"warning: {message}", file=sys.stderr)
+            else:
+                otherwise(message, category, filename, lineno, file, line)
+
+        warnings.showwarning = show
+        yield
 
 
 def _output_was_closed() -> bool:

@@ -7,7 +7,6 @@ that solid is sampled at the nodes of a coarser grid.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,9 +14,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.errors import InputError, MeshError
+from directshape_torch.errors import InputError, MeshError, UnlikelyMeshError
 from directshape_torch.files.mesh_files import read_mesh
 from directshape_torch.numerics.checks import check_positive
+from directshape_torch.shape.car_looks import check_looks
+from directshape_torch.shape.outlines import AXES, Outlines, surface_points
 
 if TYPE_CHECKING:
     import trimesh
@@ -25,12 +26,12 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Voxels = NDArray[np.bool_]
 
-_AXES = {sign + axis: k for k, axis in enumerate("xyz") for sign in "+-"}
 # A solid car fills 60 to 85 percent of its convex hull; a shell that the flood entered fills a few percent.
 _LEAST_SHARE_OF_HULL = 0.4
 # Distance transforms need some twenty bytes for each.
 _MOST_VOXELS = 2**27
-_POINTS_AT_ONCE = 2**21
+# Share of the size of a mesh: 8 mm of a car.
+_LARGEST_STEP = 0.002
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,22 @@ class GridSpec:
         origin = (-half_length * spacing_m, -above * spacing_m, -half_width * spacing_m)
         return cls(origin, spacing_m, (2 * half_length + 1, above + below + 1, 2 * half_width + 1))
 
+    @classmethod
+    def around(cls, low: Array, high: Array, spacing_m: float = 0.1) -> GridSpec:
+        """Room for shapes of any class between two corners (3,), object frame, with 0.3 m around them.
+
+        Examples:
+            >>> GridSpec.around(np.array([-0.3, -1.8, -0.3]), np.array([0.3, 0.0, 0.3])).shape
+            (13, 25, 13)
+        """
+        first, last = np.floor((low - 0.3) / spacing_m + 1e-9), np.ceil((high + 0.3) / spacing_m - 1e-9)
+        # Symmetric about the middle plane.
+        last[2] = max(last[2], -first[2])
+        first[2] = -last[2]
+        nx, ny, nz = (int(count) + 1 for count in last - first)
+        x, y, z = (spacing_m * first).tolist()
+        return cls((x, y, z), spacing_m, (nx, ny, nz))
+
 
 @dataclass(frozen=True)
 class MeshOptions:
@@ -71,12 +88,13 @@ class MeshOptions:
     symmetrise: bool = True  # average the field with its left-right mirror image
     voxel_m: float = 0.025  # fine voxel size
     closing_m: float = 0.2  # gaps up to twice this wide are closed. Narrower closings are tried first
+    are_cars: bool = True  # refuse meshes that do not look like passenger cars; False for any other class
 
     def __post_init__(self) -> None:
         for name, axis in (("forward_axis", self.forward_axis), ("up_axis", self.up_axis)):
-            if axis not in _AXES:
-                raise InputError(name, f"one of {', '.join(_AXES)}", repr(axis))
-        if _AXES[self.forward_axis] == _AXES[self.up_axis]:
+            if axis not in AXES:
+                raise InputError(name, f"one of {', '.join(AXES)}", repr(axis))
+        if AXES[self.forward_axis] == AXES[self.up_axis]:
             raise InputError("up_axis", "another axis than forward_axis", repr(self.up_axis))
         lengths = [("scale", self.scale), ("voxel_m", self.voxel_m), ("closing_m", self.closing_m)]
         for name, value in lengths + ([("length_m", self.length_m)] if self.length_m is not None else []):
@@ -88,16 +106,30 @@ def load_mesh_obj(path: Path | str, options: MeshOptions | None = None) -> trime
 
     Raises:
         DataFormatError: the file cannot be read or holds no triangles.
+        UnlikelyMeshError: the mesh does not look like a passenger car by the axes and scale of the options; the message
+            says by which ones it would. Not raised with `are_cars=False`.
     """
     import trimesh
 
-    return place_mesh(trimesh.Trimesh(*read_mesh(path), process=False), options or MeshOptions())
+    return place_mesh(trimesh.Trimesh(*read_mesh(path), process=False), options or MeshOptions(), str(path))
 
 
-def place_mesh(mesh: trimesh.Trimesh, options: MeshOptions) -> trimesh.Trimesh:
-    """A copy of a mesh in the object frame, by the axes, scale and length of the options."""
+def place_mesh(mesh: trimesh.Trimesh, options: MeshOptions, name: str = "mesh") -> trimesh.Trimesh:
+    """A copy of a mesh in the object frame, by the axes, scale and length of the options.
+
+    Raises:
+        MeshError: corners so far from the origin that single precision has rounded them.
+        UnlikelyMeshError: as `load_mesh_obj`.
+    """
     import trimesh
 
+    mesh = mesh.copy()
+    # Corners of no triangle are not seen, and would move the mesh.
+    mesh.remove_unreferenced_vertices()
+    _check_steps(np.asarray(mesh.vertices), name)
+    if options.are_cars:
+        axes, size = (options.forward_axis, options.up_axis), (options.scale, options.length_m)
+        check_looks(Outlines.of_triangles(np.asarray(mesh.triangles, dtype=np.float64)), *axes, *size, name=name)
     forward, up = _unit(options.forward_axis), _unit(options.up_axis)
     R_obj_file = np.stack([forward, -up, np.cross(forward, -up)])
     vertices = options.scale * np.asarray(mesh.vertices, dtype=np.float64) @ R_obj_file.T
@@ -108,8 +140,21 @@ def place_mesh(mesh: trimesh.Trimesh, options: MeshOptions) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, mesh.faces, process=False)
 
 
+def _check_steps(vertices: Array, name: str) -> None:
+    """Refuse a mesh so far from its origin that single precision rounds its corners to visible steps."""
+    with np.errstate(all="ignore"):
+        step = float(np.spacing(np.float32(np.abs(vertices).max())))
+        is_single = bool((vertices == vertices.astype(np.float32)).all())
+        size = float(np.ptp(vertices, axis=0).max())
+    if is_single and step > _LARGEST_STEP * size:
+        raise MeshError(
+            f"{name}: corners as far as {np.abs(vertices).max():.4g} from the origin of a mesh of size {size:.4g} are "
+            f"rounded to steps of {step:.2g}; move the mesh to its origin before it is written"
+        )
+
+
 def _unit(axis: str) -> Array:
-    return np.asarray(np.eye(3)[_AXES[axis]] * (1.0 if axis[0] == "+" else -1.0))
+    return np.asarray(np.eye(3)[AXES[axis]] * (1.0 if axis[0] == "+" else -1.0))
 
 
 def mesh_to_sdf(
@@ -123,7 +168,7 @@ def mesh_to_sdf(
     Args:
         mesh_obj: in the object frame, metres; need not be watertight.
         grid: where to sample; the mesh should lie inside.
-        options: voxel size, closing and symmetry (axes and scale are `load_mesh_obj`'s business).
+        options: voxel size, closing, symmetry and class (axes and scale are `load_mesh_obj`'s business).
         name: for messages.
 
     Returns:
@@ -131,6 +176,7 @@ def mesh_to_sdf(
 
     Raises:
         MeshError: the mesh cannot be made solid, or does not fit into the grid.
+        UnlikelyMeshError: in the object frame it does not look like a passenger car. Not raised with `are_cars=False`.
 
     Examples:
         >>> import trimesh
@@ -142,6 +188,8 @@ def mesh_to_sdf(
     from scipy.ndimage import map_coordinates
 
     options = options or MeshOptions()
+    if options.are_cars:
+        _check_placed(mesh_obj, name)
     _check_fits(mesh_obj, grid, name)
     surface, origin = _voxelise(mesh_obj, grid, options)
     solid = _solid(surface, mesh_obj, options, name)
@@ -160,6 +208,14 @@ def mesh_to_sdf(
     return sdf.astype(np.float32)
 
 
+def _check_placed(mesh_obj: trimesh.Trimesh, name: str) -> None:
+    try:
+        check_looks(Outlines.of_triangles(np.asarray(mesh_obj.triangles, dtype=np.float64)), "+x", "-y", name=name)
+    except UnlikelyMeshError as problem:
+        found = f"{problem.found}; bring it to the object frame (x forward, y down, metres) by place_mesh"
+        raise UnlikelyMeshError(found, problem.cure) from problem
+
+
 def _check_fits(mesh_obj: trimesh.Trimesh, grid: GridSpec, name: str) -> None:
     low = np.array(grid.origin)
     high = low + grid.spacing_m * (np.array(grid.shape) - 1)
@@ -167,7 +223,8 @@ def _check_fits(mesh_obj: trimesh.Trimesh, grid: GridSpec, name: str) -> None:
     if not ((mesh_obj.bounds[0] >= low).all() and (mesh_obj.bounds[1] <= high).all()):
         raise MeshError(
             f"{name}: extents {np.round(mesh_obj.bounds, 2).tolist()} m leave the grid {low.round(2).tolist()} to "
-            f"{high.round(2).tolist()} m; check axes and scale, or normalise the length"
+            f"{high.round(2).tolist()} m; check axes and scale, normalise the length, or fit the grid to the mesh "
+            "(GridSpec.around, build-prior --not-cars)"
         )
 
 
@@ -184,25 +241,10 @@ def _voxelise(mesh_obj: trimesh.Trimesh, grid: GridSpec, options: MeshOptions) -
         got = f"{math.prod(shape)} by {options.voxel_m:g} m"
         raise InputError("voxel_m", f"at most {_MOST_VOXELS} voxels", got, "raise it, or lower closing_m")
     voxels = np.zeros(shape, dtype=bool)
-    for points in _surface_points(mesh_obj, half_cell):
+    for points in surface_points(mesh_obj.triangles, half_cell):
         index = np.floor((points - low) / options.voxel_m + 0.5).astype(int)
         voxels[index[:, 0], index[:, 1], index[:, 2]] = True
     return voxels, low
-
-
-def _surface_points(mesh_obj: trimesh.Trimesh, step_m: float) -> Iterator[Array]:
-    """Points on all triangles, on barycentric lattices at most `step_m` apart, some million at a time."""
-    triangles = np.asarray(mesh_obj.triangles, dtype=np.float64)
-    longest = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
-    divisions = np.maximum(np.ceil(longest / step_m).astype(int), 1)
-    for count in np.unique(divisions):
-        i, j = np.meshgrid(np.arange(count + 1), np.arange(count + 1), indexing="ij")
-        keep = i + j <= count
-        weights = np.stack([i[keep], j[keep], count - i[keep] - j[keep]], axis=1) / count
-        chosen = triangles[divisions == count]
-        at_once = max(_POINTS_AT_ONCE // len(weights), 1)
-        for first in range(0, len(chosen), at_once):
-            yield np.einsum("wk,tkc->twc", weights, chosen[first : first + at_once]).reshape(-1, 3)
 
 
 def _solid(surface: Voxels, mesh_obj: trimesh.Trimesh, options: MeshOptions, name: str) -> Voxels:

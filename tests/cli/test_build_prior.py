@@ -1,12 +1,16 @@
 import json
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import trimesh
 from parametric_cars.measures import sample_car
 from parametric_cars.surfaces import car_mesh
 
 from directshape_torch.cli import build_prior
-from directshape_torch.cli.main import make_parser
+from directshape_torch.cli.main import main, make_parser
+from directshape_torch.files.mesh_files import read_mesh
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 
@@ -59,3 +63,71 @@ def test_two_cars_say_nothing_of_a_third(meshes, tmp_path, capsys):
     assert run("--meshes", str(meshes), "--out", str(out), "--pattern", "car[01].*", *OPTIONS) == 0
     assert json.loads(out.with_suffix(".json").read_text())["leave_one_out_error_cm"] is None
     assert "leave-one-out error within 7 cm of the surface: not known, of two cars" in capsys.readouterr().out
+
+
+def turned(meshes: Path, folder: Path, axes: Sequence[int], scale: float, suffixes: str = ".obj .ply .off") -> Path:
+    """The meshes with their axes in another order and another unit."""
+    folder.mkdir(exist_ok=True)
+    for file in meshes.iterdir():
+        if file.suffix in suffixes.split():
+            vertices, faces = read_mesh(file)
+            trimesh.Trimesh(scale * vertices[:, axes], faces, process=False).export(folder / f"{file.stem}.ply")
+    return folder
+
+
+def test_a_folder_with_wrong_axes_and_unit_names_the_options_that_work(meshes, tmp_path, capsys):
+    # The fixture's x forward, y down, z to the left become y down, z to the left, x forward: a reflection as well.
+    folder, out = turned(meshes, tmp_path / "turned", (1, 2, 0), 1000.0), tmp_path / "car.safetensors"
+    words = ("build-prior", "--meshes", str(folder), "--out", str(out))
+    few = ("--num-codes", "1", "--spacing", "0.2", "--voxel", "0.08")
+    assert main([*words, *few]) == 2
+    said = capsys.readouterr().err
+    assert "got 0 (3 skipped, the first: " in said
+    assert "car0.ply: 1" in said
+    cure = "--forward-axis=+z --up-axis=-x --scale=0.001"
+    assert f"in millimetres; it needs {cure}, or --not-cars" in said
+    assert said.rstrip().endswith(f"; 3 of them look like cars with {cure}")
+    assert not out.exists()
+    assert main([*words, *few, *cure.split()]) == 0
+    assert PCAShapePrior.load(out).provenance.of_cars
+
+
+def test_one_wrong_mesh_among_good_ones_is_left_out_by_name(meshes, tmp_path, capsys):
+    folder = turned(meshes, tmp_path / "mixed", (0, 1, 2), 1.0, ".obj .ply")
+    turned(meshes, folder, (1, 2, 0), 1.0, ".off")
+    out = tmp_path / "car.safetensors"
+    assert run("--meshes", str(folder), "--out", str(out), *OPTIONS) == 3
+    said = capsys.readouterr().out
+    assert "skipped car2.ply: " in said
+    assert "it looks like a car lying on its side; it needs --forward-axis=+z --up-axis=-x" in said
+    report = json.loads(out.with_suffix(".json").read_text())
+    assert report["meshes"] == ["car0.ply", "car1.ply"]
+    assert list(report["skipped"]) == ["car2.ply"]
+
+
+def test_meshes_of_another_class_get_a_grid_of_their_size(tmp_path, capsys):
+    for name, size in (("a", (12.0, 2.5, 3.2)), ("b", (11.0, 2.5, 3.0)), ("c", (10.5, 2.4, 3.1))):
+        trimesh.creation.box(size).export(tmp_path / f"{name}.obj")
+    out = tmp_path / "bus.safetensors"
+    words = ("--meshes", str(tmp_path), "--out", str(out), "--num-codes", "1", "--spacing", "0.3", "--voxel", "0.1")
+    assert main(["build-prior", *words]) == 2
+    assert "--not-cars if it is of another class" in capsys.readouterr().err
+    assert run(*words, "--not-cars") == 0
+    prior = PCAShapePrior.load(out)
+    assert not prior.provenance.of_cars
+    assert prior.dimensions_mean_hwl.tolist() == pytest.approx([3.1, 2.47, 11.17], abs=0.15)
+    assert main(["build-prior", *words, "--not-cars", "--scale", "100"]) == 2
+    assert "--scale: expected meshes of at most 30 m, got none of 3" in capsys.readouterr().err
+
+
+@pytest.mark.filterwarnings("always::directshape_torch.errors.PriorWarning")
+def test_a_prior_that_is_no_car_is_warned_of_in_a_line(meshes, tmp_path, capsys):
+    folder, out = turned(meshes, tmp_path / "small", (0, 1, 2), 0.5), tmp_path / "car.safetensors"
+    assert run("--meshes", str(folder), "--out", str(out), *OPTIONS, "--not-cars") == 0
+    prior = PCAShapePrior.load(out)
+    prior.provenance = replace(prior.provenance, of_cars=True)
+    prior.save(out)
+    assert main(["inspect", "--demo", "--prior", str(out), "--car", "99", "--out", str(tmp_path / "drawn")]) == 2
+    (warning,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: "))
+    assert f"{out}, mean shape: " in warning
+    assert "it looks like a car of the length" in warning

@@ -105,7 +105,7 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
         return read_scan(path, read_calibration(calibration))
 
     def solid(path: Path) -> object:
-        grid, options = GridSpec.for_cars(0.5), MeshOptions(voxel_m=0.1)
+        grid, options = GridSpec.for_cars(0.5), MeshOptions(voxel_m=0.1, are_cars=False)
         with suppress(MeshError):
             return mesh_to_sdf(load_mesh_obj(path, options), grid, options)
         return None

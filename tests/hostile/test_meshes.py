@@ -107,12 +107,12 @@ def test_no_other_file_is_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_sizes_that_no_grid_holds(tmp_path: Path) -> None:
     path, grid = tmp_path / "a.glb", GridSpec.for_cars(0.5)
     path.write_bytes(glb())
-    for options in (MeshOptions(scale=1e308), MeshOptions(length_m=1e300)):
+    for options in (MeshOptions(scale=1e308, are_cars=False), MeshOptions(length_m=1e300, are_cars=False)):
         with pytest.raises(MeshError, match="leave the grid"), np.errstate(all="ignore"):
             mesh_to_sdf(load_mesh_obj(path, options), grid, options)
-    for options in (MeshOptions(voxel_m=1e-4), MeshOptions(closing_m=1e6)):
+    for options in (MeshOptions(voxel_m=1e-4, are_cars=False), MeshOptions(closing_m=1e6, are_cars=False)):
         with pytest.raises(InputError, match="voxel_m: expected at most"):
-            mesh_to_sdf(load_mesh_obj(path), grid, options)
+            mesh_to_sdf(load_mesh_obj(path, options), grid, options)
 
 
 def test_long_thin_triangles_take_no_memory() -> None:
@@ -121,7 +121,11 @@ def test_long_thin_triangles_take_no_memory() -> None:
     faces = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [0, 2, 3]] * 100)
     tracemalloc.start()
     try:
-        mesh_to_sdf(trimesh.Trimesh(corners, faces, process=False), GridSpec.for_cars(0.5), MeshOptions(voxel_m=0.02))
+        mesh_to_sdf(
+            trimesh.Trimesh(corners, faces, process=False),
+            GridSpec.for_cars(0.5),
+            MeshOptions(voxel_m=0.02, are_cars=False),
+        )
         assert tracemalloc.get_traced_memory()[1] < 2**30
     finally:
         tracemalloc.stop()

@@ -46,7 +46,7 @@ def test_no_surface_and_wrong_shapes():
 
 
 GRID = GridSpec.for_cars(0.2)
-COARSE = MeshOptions(voxel_m=0.05)
+COARSE = MeshOptions(voxel_m=0.05, are_cars=False)
 SIZE = np.array([4.0, 1.5, 1.8])
 
 
@@ -94,13 +94,13 @@ def test_symmetry_is_exact_and_can_be_switched_off():
     )
     even = mesh_to_sdf(one_sided, GRID, COARSE)
     np.testing.assert_allclose(even, even[:, :, ::-1], atol=1e-6)
-    odd = mesh_to_sdf(one_sided, GRID, MeshOptions(voxel_m=0.05, symmetrise=False))
+    odd = mesh_to_sdf(one_sided, GRID, MeshOptions(voxel_m=0.05, symmetrise=False, are_cars=False))
     assert np.abs(odd - odd[:, :, ::-1]).max() > 0.1
 
 
 def test_too_large_mesh_names_its_extents():
     with pytest.raises(MeshError, match="leave the grid"):
-        mesh_to_sdf(box_on_the_ground().apply_scale(2.0), GRID)
+        mesh_to_sdf(box_on_the_ground().apply_scale(2.0), GRID, COARSE)
 
 
 @pytest.mark.parametrize("suffix", ["obj", "ply", "glb", "off", "stl"])
