@@ -93,6 +93,8 @@ def run(args: argparse.Namespace) -> int:
     report = _report(prior, samples, tuple(grids), reasons)
     atomic_files.write_json(args.out.with_suffix(".json"), report)
     print(_report_text(args.out, report))
+    if any(isinstance(problem, UnlikelyMeshError) and problem.cure for problem in skipped.values()):
+        print("to use those too, bring all meshes to the same axes and unit first (docs/bring_your_own_shapes.md)")
     return 3 if skipped else 0
 
 

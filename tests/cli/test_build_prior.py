@@ -100,6 +100,7 @@ def test_one_wrong_mesh_among_good_ones_is_left_out_by_name(meshes, tmp_path, ca
     said = capsys.readouterr().out
     assert "skipped car2.ply: " in said
     assert "it looks like a car lying on its side; it needs --forward-axis=+z --up-axis=-x" in said
+    assert said.rstrip().endswith("bring all meshes to the same axes and unit first (docs/bring_your_own_shapes.md)")
     report = json.loads(out.with_suffix(".json").read_text())
     assert report["meshes"] == ["car0.ply", "car1.ply"]
     assert list(report["skipped"]) == ["car2.ply"]
