@@ -50,6 +50,8 @@ def test_dimensions_that_are_quadratic_in_the_code_are_found() -> None:
     torch.testing.assert_close(at.J_hwl_code[0, 2, 0], torch.tensor(0.2, dtype=torch.float64), atol=1e-6, rtol=0)
 
 
+# Nothing that looks like a car comes of so few steps.
+@pytest.mark.filterwarnings("ignore::directshape_torch.errors.PriorWarning")
 def test_training_lowers_the_error_and_repeats_to_the_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(script, "NEAR_POINTS", 300)
     monkeypatch.setattr(script, "FAR_POINTS", 100)
