@@ -33,7 +33,7 @@ _LENGTHS_M, _WIDTHS_M, _HEIGHTS_M = (2.4, 6.2), (1.1, 2.8), (0.9, 2.5)
 _LENGTH_TO_WIDTH, _HEIGHT_TO_WIDTH, _LENGTH_TO_HEIGHT = (1.55, 3.3), (0.5, 1.4), (1.5, 4.3)
 # Real cars and their mirror images overlap by 0.98 and more, as other sides do by 0.88 at most.
 _LEAST_OVERLAP = 0.93
-# Cars have the centre at 0.36 to 0.47 of the length from the rear, pick-ups at 0.49 to 0.54.
+# Cars have the centre at 0.36 to 0.47 of the length from the rear, pick-ups at 0.49 to 0.541.
 _FOREMOST_ROOF = 0.543
 # Of a view from the front: 1 for every real and parametric car.
 _CLEAR_GAP = 0.5
