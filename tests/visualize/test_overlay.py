@@ -97,7 +97,8 @@ def call_of_two_frames() -> tuple[FrameBatch, Detections, RefinementResult]:
     prior, street = cached_street()
     d = disturbed(street.detections)
     seen = torch.tensor([False, True])
-    detections = replace(d, frame_index=torch.tensor([0, 1]), has_mask_left=seen, has_mask_right=seen)
+    masks = {"mask_left": d.mask_left.where(seen), "mask_right": d.mask_right.where(seen)}
+    detections = replace(d, frame_index=torch.tensor([0, 1]), **masks)
     frames = joined_frames([street.frames, street.frames])
     result = DirectShapeRefiner(prior, load_config("fast"))(frames, detections)
     # Grey images would hide grey lines.
