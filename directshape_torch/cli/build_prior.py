@@ -142,7 +142,9 @@ def _find_meshes(folder: Path, pattern: str) -> list[Path]:
     """Mesh files below a folder, sorted."""
     if not folder.is_dir():
         raise InputError("--meshes", "a folder", str(folder))
-    files = sorted(f for f in folder.glob(pattern) if f.suffix.lower() in MESH_SUFFIXES and f.is_file())
+    every = (file for file in folder.glob(pattern) if file.suffix.lower() in MESH_SUFFIXES and file.is_file())
+    # macOS puts a ._NAME beside each file that it copies.
+    files = sorted(file for file in every if not file.name.startswith("."))
     if not files:
         raise InputError("--meshes", f"{', '.join(MESH_SUFFIXES)} files matching {pattern!r}", f"none in {folder}")
     return files

@@ -23,7 +23,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         required=True,
         metavar="DIR",
-        help="KITTI labels, NNNNNN.txt, or of tracking: SEQUENCE.txt, or one file",
+        help="KITTI labels, NNNNNN.txt, or of tracking: SEQUENCE.txt, or one file, or a plain folder",
     )
     for name, what in (("before", "result files that went in"), ("after", "result files that came out")):
         parser.add_argument(

@@ -68,7 +68,7 @@ def add_layout_options(group: argparse._ActionsContainer, required: bool = False
         choices=get_args(LayoutName),
         default="kitti",
         help="of the files below ROOT (docs/inputs.md): KITTI's object benchmark (default), a raw drive or day of "
-        "drives, a tracking sequence or all of them, Stereo 2015, or a plain folder with JSON",
+        "drives, a tracking or odometry sequence or all of them, Stereo 2015, or a plain folder with JSON",
     )
     group.add_argument("--frames", nargs="+", metavar="ID", type=frame_id_of, help="only these frames, e.g. 107 7322")
     group.add_argument("--classes", nargs="+", default=["Car"], metavar="NAME", help="types to refine (default: Car)")
@@ -81,7 +81,12 @@ def add_rig_option(group: argparse._ActionsContainer, words: str) -> None:
 
 def add_mask_options(group: argparse._ActionsContainer) -> None:
     """The ways to name instance masks, for `mask_source`."""
-    group.add_argument("--masks", type=Path, metavar="DIR", help="NNNNNN.json, or instance_2 and instance_3 with PNG")
+    group.add_argument(
+        "--masks",
+        type=Path,
+        metavar="DIR",
+        help="NNNNNN.json, or instance_2 and instance_3 with PNG, or SEQUENCE.txt of KITTI MOTS",
+    )
     group.add_argument("--masks-left", type=Path, metavar="FILE", help="COCO results of the left images")
     group.add_argument("--masks-right", type=Path, metavar="FILE", help="COCO results of the right images")
 
@@ -117,7 +122,7 @@ def add_device_option(group: argparse._ActionsContainer) -> None:
 def add_frame_choice(parser: argparse.ArgumentParser, default: str) -> None:
     """`--split` or `--frames`; `default` says which frames count without them."""
     chosen = parser.add_mutually_exclusive_group()
-    chosen.add_argument("--split", type=Path, metavar="FILE", help=f"one frame id a line; default: {default}")
+    chosen.add_argument("--split", type=Path, metavar="FILE", help=f"a frame a line; default: {default}")
     chosen.add_argument("--frames", nargs="+", metavar="ID", type=frame_id_of, help="only these frames, e.g. 107 7322")
 
 

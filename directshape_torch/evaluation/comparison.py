@@ -12,7 +12,13 @@ import numpy as np
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.bootstrap import CarBootstrap, Estimate, MetricSummary, Statistic
-from directshape_torch.evaluation.matching import chosen_frames, files_of_frames, is_counted, match_to_labels
+from directshape_torch.evaluation.matching import (
+    chosen_frames,
+    files_of_frames,
+    is_counted,
+    match_to_labels,
+    objects_of_frame,
+)
 from directshape_torch.evaluation.pose_error import CarErrors, errors_of
 from directshape_torch.io.kitti_labels import KittiObject, objects_in, objects_path
 from directshape_torch.io.result_files import read_shapes
@@ -170,12 +176,12 @@ def _frames_of(before: Path, after: Path) -> tuple[str, ...]:
 
 def _cars_of_frame(sources: tuple[Path, Path, Path], frame_id: str) -> tuple[list[ComparedCar], int]:
     """Counted labels of a frame that have a detection, and the number of those that count at all."""
-    label_path, before_path, after_path = (objects_path(source, frame_id) for source in sources)
-    labels = objects_in(label_path, frame_id)
+    before_path, after_path = (objects_path(source, frame_id) for source in sources[1:])
+    labels = objects_of_frame(sources[0], frame_id, are_labels=True)
     if not after_path.is_file():
         cure = "was it refined? name the frames that were with --frames or --split"
         raise DataFormatError(after_path, f"there is no result of frame {frame_id}", cure=cure)
-    before, after = objects_in(before_path, frame_id), objects_in(after_path, frame_id)
+    before, after = objects_of_frame(sources[1], frame_id), objects_in(after_path, frame_id)
     _check_same_lines(before_path, before, after_path, after)
     lines = [pair for pair in zip(before, after, strict=True) if pair[0].type == "Car" and pair[0].has_box_3d]
     found = match_to_labels([old for old, _ in lines], labels)

@@ -14,6 +14,7 @@ from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.bootstrap import CarBootstrap, MetricSummary
 from directshape_torch.evaluation.matching import chosen_frames, is_counted, match_to_labels
 from directshape_torch.evaluation.shape_error import TAUS_M, EstimatedCar, ShapeError, folder_of_maps, segments_of
+from directshape_torch.files.find_files import visible_files
 from directshape_torch.io.instance_masks import MaskSource, file_of_frame
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import poses_cam, read_objects
@@ -145,7 +146,7 @@ class _Inputs(NamedTuple):
 
 
 def _chosen(inputs: _Inputs, frames: Iterable[str | int] | None, split: Path | str | None) -> list[str]:
-    with_truth = sorted(path.stem for path in inputs.maps.glob("*.png"))
+    with_truth = [path.stem for path in visible_files(inputs.maps, [".png"])]
     if frames is not None or split is not None:
         return chosen_frames(with_truth, frames, split, "frames with ground truth")
     found = [frame_id for frame_id in with_truth if shapes_path(inputs.refined_dir, frame_id).is_file()]

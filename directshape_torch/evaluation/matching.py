@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.errors import InputError
-from directshape_torch.files.read_files import read_lines
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.files.find_files import found, visible_files
 from directshape_torch.geometry.image_boxes import box_iou
-from directshape_torch.io.frame_layout import frames_among
-from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io import folder_files
+from directshape_torch.io.frame_layout import frames_among, frames_of_split
+from directshape_torch.io.kitti_labels import KittiObject, objects_in, objects_path
 
 _MINIMUM_IOU_2D = 0.3
 # Within which a detection without a 2D box takes a label, metres along the ground.
@@ -67,9 +68,33 @@ def _image_boxes(objects: Sequence[KittiObject]) -> NDArray[np.float64]:
 
 
 def files_of_frames(folder: Path) -> dict[str, Path]:
-    """The files `FRAME.txt` of a folder, or of `data` below it, by frame."""
+    """The files `FRAME.txt` of a folder, or of `data` below it, else those of a plain folder, by frame."""
     nested = folder / "data"
-    return {path.stem: path for path in sorted((nested if nested.is_dir() else folder).glob("*.txt"))}
+    files = visible_files(nested if nested.is_dir() else folder, [".txt"])
+    return {path.stem: path for path in files or visible_files(_frames_in(folder), [".json"])}
+
+
+def objects_of_frame(source: Path, frame_id: str, are_labels: bool = False) -> list[KittiObject]:
+    """The detections or labels of a frame in KITTI's files (`kitti_labels.objects_path`) or those of a plain folder.
+
+    Raises:
+        DataFormatError: there is no file of the frame, it is damaged, or it holds no labels.
+    """
+    in_folder = found(_frames_in(source) / f"{frame_id}.json")
+    if in_folder is None:
+        return objects_in(objects_path(source, frame_id), frame_id)
+    rig = in_folder.parent.parent / "rig.json"
+    if not are_labels:
+        return folder_files.detections_of(in_folder, rig)
+    labels = folder_files.labels_of(in_folder, rig)
+    if labels is None:
+        raise DataFormatError(in_folder, "holds no 'labels'", cure="see docs/plain_folder.md")
+    return labels
+
+
+def _frames_in(folder: Path) -> Path:
+    """The folder of a plain folder's JSON files, which may be named by itself."""
+    return folder / "frames" if (folder / "frames").is_dir() else folder
 
 
 def chosen_frames(
@@ -82,7 +107,7 @@ def chosen_frames(
         DataFormatError: the file cannot be read.
     """
     if split is not None:
-        known = frames_among(known, [line.text for line in read_lines(split)], expected)
+        known = frames_of_split(split, known, lambda _: False)
     chosen = list(known) if frames is None else frames_among(known, frames, expected)
     if not chosen:
         raise InputError("frames", f"at least one of the {expected}", "none", "check the choice of frames")

@@ -6,9 +6,11 @@ is ever unpickled.
 
 from __future__ import annotations
 
+import codecs
 import json
 import math
 import os
+import re
 import stat
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,6 +31,9 @@ _MOST_TEXT_BYTES = 2**24
 # Parsed JSON takes some twenty times its size.
 _MOST_JSON_BYTES = 2**28
 _MOST_DIGITS = 18
+_UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+# Lines end as on Unix, on Windows (whose other half stays, so that lines are copied as they are) or on old Macs.
+_LINE_END = re.compile(r"\n|\r(?!\n)")
 # What is left of the 255 that file systems take belongs to endings and to the names of temporary files.
 _MOST_NAME_BYTES = 200
 _T = TypeVar("_T")
@@ -88,11 +93,17 @@ def _open_at_once(path: str, flags: int) -> int:
 
 
 def read_text(path: Path | str, most: int = _MOST_TEXT_BYTES, cure: str = "check the path") -> str:
-    """The content of a UTF-8 text file; raises like `read_bytes`, and where it is no such text."""
+    """The content of a text file in UTF-8, or in UTF-16 where it begins with a mark of that; the mark is left out.
+
+    PowerShell and Excel begin texts with such a mark. Raises like `read_bytes`, and where it is no such text.
+    """
+    content = read_bytes(path, most, cure)
+    encoding = "utf-16" if content.startswith(_UTF16_MARKS) else "utf-8-sig"
     try:
-        return read_bytes(path, most, cure).decode("utf-8")
+        return content.decode(encoding)
     except UnicodeDecodeError as error:
-        raise DataFormatError(path, f"is not UTF-8 text ({error.reason} at byte {error.start})") from error
+        problem = f"is not {error.encoding.upper()} text ({error.reason} at byte {error.start})"
+        raise DataFormatError(path, problem, cure="save it as UTF-8") from error
 
 
 def remembered(read: Callable[[Path], _T]) -> Callable[[Path | str], _T]:
@@ -130,7 +141,7 @@ class Line:
 
 def read_lines(path: Path | str) -> list[Line]:
     """The lines of a text file that are not blank; raises like `read_text`."""
-    lines = (Line(number, raw.strip(), raw) for number, raw in enumerate(read_text(path).split("\n"), start=1))
+    lines = (Line(number, raw.strip(), raw) for number, raw in enumerate(_LINE_END.split(read_text(path)), start=1))
     return [line for line in lines if line.text]
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.files.find_files import found, is_called, visible_files
+from directshape_torch.files.read_files import is_frame_id, read_lines
 from directshape_torch.io import folder_files
 from directshape_torch.io.image_files import IMAGE_ENDINGS
 from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration, read_plane, read_velo_to_cam
@@ -63,9 +65,9 @@ class FrameFiles:
         """The ground truth, or None."""
         if _is_json(self.detections):
             return folder_files.labels_of(self.detections, self.calibration)
-        if self.labels is None or not self.labels.is_file():
+        if self.labels is None:
             return None
-        of_frame = self.labels.stem in self.stems
+        of_frame = is_called(self.labels, self.stems)
         return read_objects(self.labels, is_label=True) if of_frame else objects_in(self.labels, *self.stems)
 
     def read_plane(self, needed: bool = False) -> NDArray[np.float64] | None:
@@ -120,7 +122,7 @@ def candidates(folder: Path, names: Sequence[str], endings: Sequence[str]) -> li
 
 def first_existing(paths: Sequence[Path]) -> Path:
     """The first file that exists, else the last of all."""
-    return next((path for path in paths if path.is_file()), paths[-1])
+    return next((path for path in map(found, paths) if path is not None), paths[-1])
 
 
 def frames_among(known: Sequence[str], wanted: Iterable[str | int], expected: str) -> list[str]:
@@ -147,6 +149,42 @@ def frames_among(known: Sequence[str], wanted: Iterable[str | int], expected: st
     return list(dict.fromkeys(found[key] for key in words.values()))
 
 
+def frames_of_split(path: Path | str, known: Sequence[str], exists: Callable[[str], bool]) -> list[str]:
+    """The frames that the lines of a file name, each once.
+
+    A line is an id, a number with leading zeros or without, a path that ends in an id (`image_2/000107.png`), or folder
+    and number of a drive as in lists for KITTI's raw data (`2011_09_26/2011_09_26_drive_0005_sync 0000000005 l`).
+
+    Args:
+        path: the file.
+        known: frames with detections.
+        exists: whether there is a frame of a name; one without detections is reported when its turn comes.
+
+    Raises:
+        DataFormatError: a line names no frame.
+    """
+    of_number = {_number(name.removesuffix("_10")): name for name in reversed(known)}
+    found = of_number | {name: name for name in known}
+    chosen = []
+    for line in read_lines(path):
+        folder, *others = (PurePath(word).name for word in line.text.split())
+        words = [line.text, *(f"{folder}_{word}" for word in others[:1]), *others[:1], folder]
+        names = [name for word in words for name in (word, _without_ending(word))]
+        keys = [key for name in names for key in (name, _number(name)) if key in found]
+        unknown = [name for name in names if is_frame_id(name) and exists(name)] if not keys else []
+        if not keys and not unknown:
+            example = f", such as {known[0]}" if known else ""
+            raise line.error(path, "names no frame of the data", f"write one id a line{example}")
+        chosen.append(found[keys[0]] if keys else unknown[0])
+    return list(dict.fromkeys(chosen))
+
+
+def _without_ending(word: str) -> str:
+    """A name without the ending of an image, a scan or a file of detections."""
+    name = PurePath(word)
+    return name.stem if name.suffix.lower() in (*IMAGE_ENDINGS, ".bin", ".txt", ".json") else word
+
+
 def _number(word: str) -> str:
     """A number without leading zeros; other names as they are."""
     return word.lstrip("0") or "0" if word.isdecimal() else word
@@ -161,7 +199,7 @@ def existing_folder(path: Path, problem: str, cure: str = "check the path") -> P
 
 def image_stems(folder: Path) -> list[str]:
     """Names without ending of the images in a folder, sorted."""
-    return sorted({path.stem for path in folder.glob("*") if path.suffix.lstrip(".") in IMAGE_ENDINGS})
+    return sorted({path.stem for path in visible_files(folder, IMAGE_ENDINGS)})
 
 
 def _is_json(path: Path) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError
+from directshape_torch.files.find_files import found
 from directshape_torch.files.read_files import read_bytes
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -25,7 +26,7 @@ _MOST_PIXELS = 2**26
 _CURE = "copy or download the file again"
 # Of a pixel of disparity, in the maps of KITTI's benchmarks.
 _UNITS_PER_PIXEL = 256
-IMAGE_ENDINGS = ("png", "jpg", "jpeg")
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
 
 
 def read_rgb(path: Path | str) -> NDArray[np.uint8]:
@@ -88,8 +89,8 @@ def read_disparity(
 
 def find_image(folder: Path, stem: str) -> Path:
     """The image `stem` with one of the endings png, jpg, jpeg in `folder`; the png path if there is none."""
-    candidates = [folder / f"{stem}.{ending}" for ending in IMAGE_ENDINGS]
-    return next((path for path in candidates if path.is_file()), candidates[0])
+    candidates = [folder / f"{stem}{ending}" for ending in IMAGE_ENDINGS]
+    return next((path for path in map(found, candidates) if path is not None), candidates[0])
 
 
 def _decode(path: Path | str, flags: int) -> NDArray[Any]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, shown
+from directshape_torch.files.find_files import found
 from directshape_torch.io.image_files import read_single_channel
 from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.scene import Side
@@ -101,8 +102,7 @@ class MaskSource(Protocol):
 
 def file_of_frame(directory: Path, name: str) -> Path:
     """`directory/name`, or `directory/data/name` where that exists."""
-    nested = directory / "data" / name
-    return nested if nested.is_file() else directory / name
+    return found(directory / "data" / name) or found(directory / name) or directory / name
 
 
 def read_mask(path: Path, where: str, mask: Any, size_hw: tuple[int, int], root: Path) -> NDArray[Any]:

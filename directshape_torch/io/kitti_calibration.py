@@ -18,7 +18,7 @@ from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
 
 _PLANE_CURE = "write four lines: '# Plane', 'Width 4', 'Height 1', then a b c d with a x + b y + c z + d = 0"
-# The name of each matrix in the object, the tracking and the raw layout, and its shape.
+# The name of each matrix in the object, the tracking, the raw and the odometry layout, and its shape.
 _CAMERAS: dict[str, tuple[str, tuple[int, int]]] = {
     "P2": ("P2", (3, 4)),
     "P_rect_02": ("P2", (3, 4)),
@@ -29,6 +29,7 @@ _CAMERAS: dict[str, tuple[str, tuple[int, int]]] = {
     "R_rect_00": ("R0_rect", (3, 3)),
     "Tr_velo_to_cam": ("Tr_velo_to_cam", (3, 4)),
     "Tr_velo_cam": ("Tr_velo_to_cam", (3, 4)),
+    "Tr": ("Tr_velo_to_rect", (3, 4)),
 }
 _LIDAR = {"R": ("R", (3, 3)), "T": ("T", (3, 1))}
 
@@ -55,9 +56,18 @@ class KittiCalibration:
 
 
 def read_calibration(path: Path | str) -> KittiCalibration:
-    """Read a KITTI calibration file (object `calib/NNNNNN.txt`, tracking `calib.txt`, raw `calib_cam_to_cam.txt`)."""
+    """Read a KITTI calibration file.
+
+    It is `calib/NNNNNN.txt` of the object benchmark, `calib.txt` of a tracking or an odometry sequence, or
+    `calib_cam_to_cam.txt` of a raw drive.
+    """
     cure = "a stereo pair needs the projections P2 and P3"
-    return KittiCalibration(Path(path), **_read_matrices(path, _CAMERAS, ("P2", "P3"), cure))
+    matrices = _read_matrices(path, _CAMERAS, ("P2", "P3"), cure)
+    velo_to_rect = matrices.pop("Tr_velo_to_rect", None)
+    if velo_to_rect is not None:
+        # The odometry benchmark has its rotation to rectified images in it.
+        matrices = {"R0_rect": np.eye(3), "Tr_velo_to_cam": velo_to_rect} | matrices
+    return KittiCalibration(Path(path), **matrices)
 
 
 def read_velo_to_cam(path: Path | str) -> NDArray[np.float64]:

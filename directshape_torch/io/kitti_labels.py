@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
+from directshape_torch.files.find_files import is_called
 from directshape_torch.files.read_files import Line, finite_numbers, read_lines, remembered
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.instance_masks import file_of_frame
@@ -133,7 +134,7 @@ def objects_path(source: Path, frame_id: str) -> Path:
 
 def objects_in(path: Path, *names: str) -> list[KittiObject]:
     """The objects of a frame in a file that is called as the frame, else in one of the tracking benchmark."""
-    if path.stem in names:
+    if is_called(path, names):
         return read_objects(path)
     # A list of the caller's own, for that of the file is remembered.
     return [*read_tracking_objects(path).get(frame_number(names[0]), [])]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.files.find_files import found, visible_files
 from directshape_torch.io.frame_layout import FrameFiles, candidates, existing_folder, first_existing, image_stems
 from directshape_torch.io.image_files import find_image
 
@@ -62,6 +63,14 @@ TRACKING = Patterns(
     "planes/{sequence}/{stem}.txt",
     "label_02/{sequence}.txt",
     times="times/{sequence}.txt",
+    trajectory="poses/{sequence}.txt",
+)
+ODOMETRY = Patterns(
+    "sequences/{sequence}/image_2/{stem}",
+    "sequences/{sequence}/image_3/{stem}",
+    "sequences/{sequence}/calib.txt",
+    "sequences/{sequence}/planes/{stem}.txt",
+    times="sequences/{sequence}/times.txt",
     trajectory="poses/{sequence}.txt",
 )
 # In the folder of the day, and with a calibration in the drive itself.
@@ -121,15 +130,15 @@ class Layout:
             return base / pattern.format(sequence=name, stem=stem, scene=stem.partition("_")[0])
 
         def known(pattern: str) -> Path | None:
-            return path(pattern) if pattern and path(pattern).is_file() else None
+            return found(path(pattern)) if pattern else None
 
         left, right = path(patterns.left), path(patterns.right)
-        found = candidates(self.detections_dir, [*names, name] if name else names, [self._ending])
+        places = candidates(self.detections_dir, [*names, name] if name else names, [self._ending])
         return FrameFiles(
             left=find_image(left.parent, left.name),
             right=find_image(right.parent, right.name),
-            calibration=path(patterns.calibration),
-            detections=first_existing([*found, self.detections_dir / f"{names[0]}{self._ending}"]),
+            calibration=first_existing([path(patterns.calibration)]),
+            detections=first_existing([*places, self.detections_dir / f"{names[0]}{self._ending}"]),
             names=tuple(dict.fromkeys(names)),
             plane=first_existing([path(patterns.plane), path(patterns.plane, without_end)]),
             labels=known(patterns.labels),
@@ -165,9 +174,16 @@ class Layout:
         return sorted(found)
 
     def _detection_stems(self, folder: Path) -> list[str]:
-        """Names without ending of the result files in a folder, or in its folder `data` where there is one, sorted."""
+        """Names without ending of the result files in a folder, or in its folder `data` where there is one, sorted.
+
+        What has no digit in its name, README.txt, is no frame unless there is an image of that name.
+        """
         nested = folder / "data"
-        return sorted(path.stem for path in (nested if nested.is_dir() else folder).glob(f"*{self._ending}"))
+        stems = [path.stem for path in visible_files(nested if nested.is_dir() else folder, [self._ending])]
+        return sorted(stem for stem in stems if any(map(str.isdigit, stem)) or self._has_image(stem))
+
+    def _has_image(self, stem: str) -> bool:
+        return any(stem in self._image_stems(name) for name in self._sequences)
 
     def _image_stems(self, name: str) -> list[str]:
         base, patterns = self._sequences[name]
@@ -178,38 +194,65 @@ class Layout:
 
 
 def object_layout(root: Path | str, detections_dir: Path | str) -> Layout:
-    """KITTI's object benchmark: `root/training` with image_2, image_3, calib, label_2, planes; detections apart."""
-    training = Path(root) / "training"
-    if not training.is_dir():
-        raise DataFormatError(root, "holds no folder 'training' in KITTI's layout", cure="check the path")
-    return Layout({"": (training, OBJECT)}, detections_dir)
+    """KITTI's object benchmark: `root/training`, else `root/testing`, else `root` itself with image_2, image_3, calib,
+    label_2, planes; detections apart.
+    """
+    base = _split_with(Path(root), "image_2")
+    if base is None:
+        problem = "holds no image_2, training/image_2 or testing/image_2 in KITTI's layout"
+        raise DataFormatError(root, problem, cure="check the path or --layout")
+    return Layout({"": (base, OBJECT)}, detections_dir)
+
+
+def _split_with(root: Path, folder: str) -> Path | None:
+    """Of `root/training`, `root/testing` and `root` the first with such a folder in it."""
+    return next((base for base in (root / "training", root / "testing", root) if (base / folder).is_dir()), None)
+
+
+def odometry_layout(root: Path | str, detections_dir: Path | str) -> Layout:
+    """KITTI's odometry benchmark in colour: `root/sequences/NN` with image_2, image_3, calib.txt and times.txt, and
+    `root/poses/NN.txt`; `root/dataset` will do for `root`, and so will the folder of one sequence.
+    """
+    root = Path(root)
+    if (root / "image_2").is_dir():
+        whole = root.resolve()
+        return Layout({whole.name: (whole.parents[1], ODOMETRY)}, detections_dir)
+    for base in (root, root / "dataset"):
+        names = sorted(path.parent.name for path in base.glob("sequences/*/image_2"))
+        if names:
+            return Layout(dict.fromkeys(names, (base, ODOMETRY)), detections_dir, single=False)
+    raise DataFormatError(
+        root,
+        "holds no [dataset/]sequences/NN/image_2 as KITTI's odometry data in colour",
+        cure="give the folder above 'sequences', or one sequence, or another --layout",
+    )
 
 
 def stereo2015_layout(root: Path | str, detections_dir: Path | str) -> Layout:
     """KITTI Stereo 2015 (and Scene Flow 2015): two consecutive pairs a scene, `NNNNNN_10` and `NNNNNN_11`, in
     `root/training`, `root/testing` or `root`. Detections, masks and planes of the first may be called `NNNNNN`, too.
     """
-    folders = [Path(root) / "training", Path(root) / "testing", Path(root)]
-    found = [folder for folder in folders if (folder / "calib_cam_to_cam").is_dir()]
-    if not found:
+    base = _split_with(Path(root), "calib_cam_to_cam")
+    if base is None:
         problem = "holds no [training/]calib_cam_to_cam as KITTI Stereo 2015 does"
         raise DataFormatError(root, problem, cure="check the path or --layout")
-    return Layout({"": (found[0], STEREO_2015)}, detections_dir)
+    return Layout({"": (base, STEREO_2015)}, detections_dir)
 
 
 def tracking_layout(root: Path | str, detections_dir: Path | str) -> Layout:
     """A tracking sequence (`root/image_02/NNNNNN.png`, `image_03`, `calib.txt`, `label_02.txt`, `planes`), or the
-    benchmark (`root/training` or `root` with `image_02/SEQUENCE/NNNNNN.png`, `image_03`, `calib/SEQUENCE.txt` ..).
+    benchmark (`root/training`, `root/testing` or `root` with `image_02/SEQUENCE/NNNNNN.png`, `image_03`,
+    `calib/SEQUENCE.txt` ..).
     """
     root = Path(root)
     if image_stems(root / "image_02"):
         return Layout({root.resolve().name: (root, TRACKING_SEQUENCE)}, detections_dir)
-    base = root / "training" if (root / "training" / "image_02").is_dir() else root
+    base = _split_with(root, "image_02") or root
     names = sorted(path.name for path in (base / "image_02").glob("*") if path.is_dir())
     if not names:
         raise DataFormatError(
             root,
-            "holds neither image_02/NNNNNN.png nor [training/]image_02/SEQUENCE/NNNNNN.png",
+            "holds neither image_02/NNNNNN.png nor [training/ or testing/]image_02/SEQUENCE/NNNNNN.png",
             cure="give a sequence or the folder of KITTI's tracking benchmark, or another --layout",
         )
     return Layout(dict.fromkeys(names, (base, TRACKING)), detections_dir, single=False)

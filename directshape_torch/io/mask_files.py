@@ -11,18 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError, shown
-from directshape_torch.files.read_files import read_json, remembered
+from directshape_torch.files.find_files import visible_files
+from directshape_torch.files.read_files import Line, read_json, read_lines, remembered
 from directshape_torch.io import folder_files
 from directshape_torch.io.frame_layout import FrameLayout
 from directshape_torch.io.image_files import find_image, read_single_channel
 from directshape_torch.io.instance_masks import (
     InstanceMask,
+    MaskSource,
     check_size,
     decode_segmentation,
     file_of_frame,
     read_mask,
     within_memory,
 )
+from directshape_torch.io.kitti_labels import frame_number
 from directshape_torch.scene import SIDES, Side
 
 COCO_CAR_IDS = frozenset({3})
@@ -111,6 +114,46 @@ class InstancePngMasks:
 
 
 @dataclass(frozen=True)
+class MotsTextMasks:
+    """The text file of a sequence of KITTI MOTS: `frame id class height width rle` a line, of the left images.
+
+    Instances are tracks; ids are `class * 1000 + instance`, as in the PNG files.
+    """
+
+    path: Path
+    car_ids: frozenset[int] = PNG_CAR_IDS  # classes that are cars
+
+    def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
+        lines = _mots_by_frame(self.path).get(frame_number(frame_id), [])
+        return within_memory(self.path, (self._instance(line, size_hw) for line in lines))
+
+    def files(self, frame_id: str) -> tuple[Path, ...]:  # one file serves all frames
+        return (self.path,)
+
+    def _instance(self, line: Line, size_hw: tuple[int, int]) -> InstanceMask | None:
+        _, number, category, height, width, counts = line.text.split()
+        if int(category) == _MOTS_IGNORE_CLASS:
+            return None
+        segmentation = {"size": [int(height), int(width)], "counts": counts}
+        inside = decode_segmentation(self.path, f"line {line.number}", segmentation, size_hw)
+        is_car, track = int(category) in self.car_ids, int(number) % _IDS_PER_CLASS
+        return InstanceMask.found("left", int(number), is_car, inside, track_id=track)
+
+
+@remembered
+def _mots_by_frame(path: Path) -> dict[int, list[Line]]:
+    """The lines of a text file of KITTI MOTS by frame number."""
+    frames: dict[int, list[Line]] = {}
+    for line in read_lines(path):
+        words = line.text.split()
+        if len(words) != 6 or not all(word.isdecimal() and len(word) < 10 for word in words[:5]):
+            cure = "write 'frame id class height width rle' a line, as KITTI MOTS does"
+            raise line.error(path, f"expected five whole numbers and run lengths, got {len(words)} words", cure)
+        frames.setdefault(int(words[0]), []).append(line)
+    return frames
+
+
+@dataclass(frozen=True)
 class CocoFileMasks:
     """Two plain COCO result files, left and right, with `image_id` = frame number (Detectron2, mmdet)."""
 
@@ -161,12 +204,25 @@ class LayoutMasks:
         return source.files(name)
 
 
-def _of_frame(directory: Path, names: Sequence[str]) -> tuple[FrameJsonMasks | InstancePngMasks, str]:
+def _of_frame(directory: Path, names: Sequence[str]) -> tuple[MaskSource, str]:
     """The masks of a frame's sequence, and what it is called there."""
+    text = _mots_text(directory, names)
+    if text is not None:
+        return MotsTextMasks(text), Path(names[0]).name
     places = [directory / name for name in names if (directory / name).parent.is_dir()]
     source = mask_source(places[0].parent)
     stems = [place.name for place in places if place.parent == places[0].parent]
     return source, next((stem for stem in stems if source.path(stem).is_file()), stems[0])
+
+
+def _mots_text(directory: Path, names: Sequence[str]) -> Path | None:
+    """The text file of KITTI MOTS for a frame of some names: that of its sequence, or the only one there is."""
+    if directory.is_file():
+        return directory
+    texts = visible_files(directory, [".txt"])
+    of_sequence = [text for text in texts if any(name.startswith(f"{text.stem}/") for name in names)]
+    is_single = len(texts) == 1 and not any("/" in name for name in names)
+    return of_sequence[0] if of_sequence else texts[0] if is_single else None
 
 
 def mask_source(directory: Path | str) -> FrameJsonMasks | InstancePngMasks:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -14,17 +15,24 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.errors import DirectShapeError, InputError, shown
-from directshape_torch.files.read_files import is_frame_id, read_lines
+from directshape_torch.files.read_files import is_frame_id
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.ground_plane import GroundPlane
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_detections import build_detections
-from directshape_torch.io.frame_layout import FrameFiles, FrameLayout, existing_folder, frames_among
+from directshape_torch.io.frame_layout import FrameFiles, FrameLayout, existing_folder, frames_among, frames_of_split
 from directshape_torch.io.image_files import read_disparity, read_pair
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_calibration import camera_of_rig, plane_ref_to_cam, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.io.layouts import folder_layout, object_layout, raw_layout, stereo2015_layout, tracking_layout
+from directshape_torch.io.layouts import (
+    folder_layout,
+    object_layout,
+    odometry_layout,
+    raw_layout,
+    stereo2015_layout,
+    tracking_layout,
+)
 from directshape_torch.io.mask_files import LayoutMasks
 from directshape_torch.io.mask_matching import with_image_boxes
 from directshape_torch.io.track_association import associate
@@ -33,13 +41,14 @@ from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.stereo_matching.plane_from_points import estimate_ground_plane
 
 GroundSource = Literal["auto", "file", "stereo", "camera_height"]
-LayoutName = Literal["kitti", "raw", "tracking", "stereo2015", "folder"]
+LayoutName = Literal["kitti", "raw", "tracking", "odometry", "stereo2015", "folder"]
 # `NNNNNN_10.png`, as submissions to KITTI Stereo 2015 call the first pair of a scene, else `NNNNNN.png`.
 _DISPARITIES = ("_10.png", ".png")
 _LAYOUTS: dict[LayoutName, Callable[..., FrameLayout]] = {
     "kitti": object_layout,
     "raw": raw_layout,
     "tracking": tracking_layout,
+    "odometry": odometry_layout,
     "stereo2015": stereo2015_layout,
     "folder": folder_layout,
 }
@@ -56,6 +65,7 @@ class LoadedFrame:
         refined_rows: for each input line the index of its detection, or -1 for lines to copy as they are.
         labels: the ground truth, or None where there is no label file.
         sequence: whose frames the tracks of the detections go through; see `StereoDataset.sequence_of`.
+        no_mask_reasons: for each detection why it has no left mask, else "".
     """
 
     frame: FrameBatch
@@ -101,12 +111,13 @@ def open_dataset(
     """The data set of a layout (docs/inputs.md).
 
     Args:
-        layout: "kitti" (object benchmark), "raw", "tracking", "stereo2015" or "folder"; or one of your own, which needs
-            neither `root` nor `detections_dir`.
+        layout: "kitti" (object benchmark), "raw", "tracking", "odometry", "stereo2015" or "folder"; or one of your own,
+            which needs neither `root` nor `detections_dir`.
         root: folder of the data.
         detections_dir: folder of detections; None for "folder" only: `root/frames`.
-        masks: folder of masks (see `mask_source`), a `MaskSource`, or None: those of a "folder", else none.
-        split: file with one frame id a line; default every frame that has detections.
+        masks: folder of masks (see `mask_source`), a text file of KITTI MOTS, a `MaskSource`, or None: those of a
+            "folder", else none.
+        split: file with a frame a line: its id, its number, or its image; default every frame that has detections.
         frames: ids of the frames to use, of those.
         classes: object types to refine; other lines are copied.
         ground: where ground planes come from: "auto" is file, else stereo, else camera height; with a disparity
@@ -137,9 +148,10 @@ def open_dataset(
     frame_ids = _chosen_frames(layout, split, frames)
     first = layout.files(frame_ids[0])
     if tracks and layout.sequence_of(frame_ids[0]) is None:
-        raise InputError("tracks", "a layout of sequences: tracking, raw or folder", "frames by themselves")
+        raise InputError("tracks", "a layout of sequences: tracking, odometry, raw or folder", "frames by themselves")
     if isinstance(masks, (str, Path)):
-        masks = LayoutMasks(layout, existing_folder(Path(masks), "is not a folder of masks"))
+        is_text = Path(masks).is_file() and Path(masks).suffix.lower() == ".txt"
+        masks = LayoutMasks(layout, Path(masks) if is_text else existing_folder(Path(masks), "is no folder of masks"))
     elif masks is None and first.detections.suffix == ".json":
         masks = LayoutMasks(layout, None)
     return StereoDataset(
@@ -346,10 +358,19 @@ def _to_tensor(rgb: NDArray[np.uint8], dtype: torch.dtype) -> Tensor:
     return torch.from_numpy(rgb).permute(2, 0, 1)[None].to(dtype).contiguous() / 255
 
 
+def _has_image(layout: FrameLayout, frame_id: str) -> bool:
+    """Whether there is a frame of a name that may be any word."""
+    try:
+        return layout.files(frame_id).left.is_file()
+    except InputError:
+        return False
+
+
 def _chosen_frames(
     layout: FrameLayout, split: Path | str | None, frames: Iterable[str | int] | None
 ) -> tuple[str, ...]:
-    known = layout.frame_ids() if split is None else list(dict.fromkeys(line.text for line in read_lines(split)))
+    known = layout.frame_ids()
+    known = known if split is None else frames_of_split(split, known, partial(_has_image, layout))
     where = f"{layout.detections_dir}" if split is None else f"{split}"
     if not known:
         files = f"detection file {layout.detection_file_name} in" if split is None else "frame in"

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
+from directshape_torch.files.find_files import visible_files
 from directshape_torch.geometry.projection import project
 from directshape_torch.io.frame_layout import FrameFiles, frames_among
 from directshape_torch.io.image_files import read_disparity, read_pair, read_rgb
@@ -107,10 +108,11 @@ def _evenly(frame_ids: Sequence[str]) -> list[str]:
 
 def truth_files(root: Path, source: TruthSource) -> dict[str, Path]:
     """The files of a source by frame id; of a stereo pair 2015 the first image (`NNNNNN_10`) keeps its full name."""
-    patterns = ("disp_noc_0/*.png", "disp_occ_0/*.png") if source == "disparity" else ("velodyne/*.bin",)
-    files = {path.stem: path for pattern in patterns for path in sorted((root / "training").glob(pattern))}
+    folders, ending = (("disp_noc_0", "disp_occ_0"), ".png") if source == "disparity" else (("velodyne",), ".bin")
+    found = (path for folder in folders for path in visible_files(root / "training" / folder, [ending]))
+    files = {path.stem: path for path in found}
     if not files:
-        wanted = " or ".join(f"training/{pattern}" for pattern in patterns)
+        wanted = " or ".join(f"training/{folder}/*{ending}" for folder in folders)
         cure = f"choose one of --from {', '.join(get_args(TruthSource))}"
         raise DataFormatError(root, f"holds no {wanted}", cure=cure)
     return dict(sorted(files.items()))

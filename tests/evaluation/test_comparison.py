@@ -203,3 +203,25 @@ def test_simulated_detectors(detector: str, bev_iou: float):
     overall = compare_results(root / "training" / "label_2", folder, folder).overall
     assert overall.metrics["bev_iou_mean"].after.value == pytest.approx(bev_iou, abs=2e-3)
     assert overall.num_detections == (102 if detector == "gt" else 97)
+
+
+@pytest.mark.parametrize("named", ["", "frames"])
+def test_a_run_of_a_plain_folder_is_compared_with_its_labels(tmp_path: Path, named: str) -> None:
+    """A box that was 1 m off along its length is right after: 3 / 5 to 1."""
+
+    def entry(x: float) -> dict[str, object]:
+        box = {"dimensions_hwl_m": [1.5, 2.0, 4.0], "bottom_center_m": [x, 1.6, 12.0], "rotation_y_rad": 0.0}
+        return {"class": "Car", "box_2d": [100, 100, 220, 180], **box}
+
+    frame = {"schema_version": 1, "objects": [entry(1.0)], "labels": [entry(0.0)]}
+    (tmp_path / "data" / "frames").mkdir(parents=True)
+    (tmp_path / "data" / "frames" / "a 7.json").write_text(json.dumps(frame))
+    folder = tmp_path / "data" / named
+    after = _write(tmp_path / "out" / "data", **{"fa 7": ["Car -1 -1 0 100 100 220 180 1.5 2 4 0 1.6 12 0 1"]})
+    comparison = compare_results(folder, folder, after.parent)
+    (car,) = comparison.cars
+    assert (car.frame_id, car.before.bev_iou, car.after.bev_iou) == ("a 7", pytest.approx(0.6), pytest.approx(1.0))
+    del frame["labels"]
+    (tmp_path / "data" / "frames" / "a 7.json").write_text(json.dumps(frame))
+    with pytest.raises(DataFormatError, match=r"a 7\.json: holds no 'labels'"):
+        compare_results(folder, folder, after.parent)

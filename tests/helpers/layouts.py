@@ -57,6 +57,21 @@ def write_sequence(kitti: Path, root: Path, frame_ids: tuple[str, ...], single: 
     put(calibration, base / "calib.txt" if single else base / "calib" / f"{SEQUENCE}.txt")
 
 
+def write_odometry(kitti: Path, root: Path, frame_ids: tuple[str, ...], sequence: str = "04") -> None:
+    """One sequence of the odometry benchmark with times and poses; its calibration has `Tr:` and no `R0_rect:`."""
+    base = root / "sequences" / sequence
+    for number, frame_id in enumerate(frame_ids):
+        for folder in ("image_2", "image_3"):
+            put(kitti / "training" / folder / f"{frame_id}.png", base / folder / f"{number:06d}.png")
+        put(kitti / "training" / "planes" / f"{frame_id}.txt", base / "planes" / f"{number:06d}.txt")
+    lines = (kitti / "training" / "calib" / f"{frame_ids[0]}.txt").read_text().splitlines()
+    kept = [line for line in lines if line.startswith(("P0", "P1", "P2", "P3"))]
+    write(base / "calib.txt", "\n".join([*kept, "Tr: 0 -1 0 0.1 0 0 -1 -0.2 1 0 0 -0.3", ""]))
+    write(base / "times.txt", "".join(f"{0.1 * number:e}\n" for number in range(len(frame_ids))))
+    rows = (f"1 0 0 0 0 1 0 0 0 0 1 {number}\n" for number in range(len(frame_ids)))
+    write(root / "poses" / f"{sequence}.txt", "".join(rows))
+
+
 def write_tracked(source: Path, frame_ids: tuple[str, ...], to: Path, tracks: Iterable[int] | None = None) -> None:
     """One file of the frames of a folder, each object with the track of its line, by default its number."""
     lines = [(source / f"{frame_id}.txt").read_text().splitlines() for frame_id in frame_ids]

@@ -8,6 +8,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from helpers.layouts import (
@@ -17,6 +18,7 @@ from helpers.layouts import (
     put,
     write,
     write_folder,
+    write_odometry,
     write_raw,
     write_sequence,
     write_stereo2015,
@@ -25,6 +27,7 @@ from helpers.layouts import (
 from helpers.matched_masks import instances
 
 from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.io.kitti_calibration import read_calibration
 from directshape_torch.io.stereo_dataset import LayoutName, LoadedFrame, StereoDataset, open_dataset
 
 FRAMES = ("000000", "000001")
@@ -120,6 +123,112 @@ def test_tracking_frames_called_by_sequence_in_one_folder(kitti: Path, tmp_path:
     assert replace(dataset, tracks=True).sequence_of(f"{SEQUENCE}_000001") == SEQUENCE
 
 
+@pytest.mark.parametrize("where", ["testing", "training/../testing", "."])
+def test_the_object_benchmark_without_a_training_folder(kitti_copy: Path, expected: LoadedFrame, where: str) -> None:
+    """The folder `testing`, alone below the root or named by itself."""
+    (kitti_copy / "training").rename(kitti_copy / "testing")
+    (kitti_copy / "training").mkdir()
+    root = kitti_copy / where
+    dataset = open_dataset("kitti", root, kitti_copy / "detections", kitti_copy / "masks", dtype=torch.float64)
+    assert_same(dataset, "000001", expected)
+
+
+def test_the_testing_split_of_the_tracking_benchmark(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
+    write_sequence(kitti, tmp_path, FRAMES, single=False)
+    (tmp_path / "training").rename(tmp_path / "testing")
+    _, masks = renamed(kitti, tmp_path, (f"{SEQUENCE}/000000", f"{SEQUENCE}/000001"))
+    write_tracked(kitti / "detections" / "data", FRAMES, tmp_path / "results" / f"{SEQUENCE}.txt")
+    for root in (tmp_path, tmp_path / "testing"):
+        dataset = open_dataset("tracking", root, tmp_path / "results", masks, dtype=torch.float64)
+        assert_same(dataset, f"{SEQUENCE}_000001", expected)
+
+
+@pytest.mark.parametrize("root", ["", "dataset"])
+def test_odometry(kitti: Path, tmp_path: Path, expected: LoadedFrame, root: str) -> None:
+    write_odometry(kitti, tmp_path / root, FRAMES)
+    detections, masks = renamed(kitti, tmp_path, ("04/000000", "04/000001"))
+    dataset = open_dataset("odometry", tmp_path, detections, masks, tracks=True, dtype=torch.float64)
+    assert dataset.frame_ids == ("04_000000", "04_000001")
+    assert_same(dataset, "04_000001", expected)
+    frame = dataset.load("04_000001").frame
+    assert frame.time_s is not None
+    assert frame.time_s.tolist() == pytest.approx([0.1])
+    assert frame.T_world_cam is not None
+    assert float(frame.T_world_cam[0, 2, 3]) == pytest.approx(1, abs=0.01)
+    one = open_dataset(
+        "odometry", tmp_path / root / "sequences" / "04", detections / "04", masks / "04", dtype=torch.float64
+    )
+    assert_same(one, "000001", expected)
+
+
+def test_the_scanner_of_odometry_is_placed_by_one_matrix(kitti: Path, tmp_path: Path) -> None:
+    write_odometry(kitti, tmp_path, FRAMES)
+    calibration = read_calibration(tmp_path / "sequences" / "04" / "calib.txt")
+    assert calibration.R0_rect is not None
+    assert calibration.Tr_velo_to_cam is not None
+    assert calibration.R0_rect.tolist() == np.eye(3).tolist()
+    assert calibration.Tr_velo_to_cam[:, 3].tolist() == [0.1, -0.2, -0.3]
+
+
+@pytest.mark.parametrize(
+    "text", ["1", "000001", "000001.png", "image_2/000001.PNG\r", "  1  ", "\ufeff000001.txt", "training/000001"]
+)
+def test_a_line_of_a_split_names_a_frame_in_many_ways(kitti: Path, tmp_path: Path, text: str) -> None:
+    write(tmp_path / "split.txt", f"{text}\n\n1\n")
+    dataset = open_dataset("kitti", kitti, kitti / "detections", kitti / "masks", split=tmp_path / "split.txt")
+    assert dataset.frame_ids == ("000001",)
+
+
+def test_a_split_of_raw_drives_and_lines_that_name_nothing(kitti: Path, tmp_path: Path) -> None:
+    drive = write_raw(kitti, tmp_path, FRAMES)
+    shutil.copytree(drive, drive.parent / "2011_09_26_drive_0009_sync")
+    detections, masks = renamed(kitti, tmp_path, (f"{DRIVE}/data/0000000000", f"{DRIVE}/data/0000000001"))
+    split = tmp_path / "split.txt"
+    write(split, f"{DAY}/{DRIVE} 0000000001 l\n{DAY}/2011_09_26_drive_0009_sync 0000000000 r\n")
+    dataset = open_dataset("raw", tmp_path / DAY, detections, masks, split=split)
+    # The second has no detections, which is said when its turn comes.
+    assert dataset.frame_ids == (f"{DRIVE}_0000000001", "2011_09_26_drive_0009_sync_0000000000")
+    write(split, f"{DAY}/{DRIVE} 0000000001 l\n{DAY}/{DRIVE} 0000000777 l\n")
+    with pytest.raises(DataFormatError, match=rf"split.txt, line 2: names no frame of the data: .* such as {DRIVE}"):
+        open_dataset("raw", tmp_path / DAY, detections, masks, split=split)
+
+
+@pytest.mark.parametrize("name", ["0005.txt", "instances.txt"])
+def test_text_masks_of_kitti_mots(kitti: Path, tmp_path: Path, name: str) -> None:
+    """The left masks of every form are the same, and their numbers are tracks."""
+    write_sequence(kitti, tmp_path, FRAMES, single=True)
+    lines = []
+    for number, frame_id in enumerate(FRAMES):
+        for entry in json.loads((kitti / "masks" / f"{frame_id}.json").read_text()):
+            if entry["image"] == "left":
+                size, counts = entry["segmentation"]["size"], entry["segmentation"]["counts"]
+                lines.append(f"{number} {1003 + entry['instance_id']} 1 {size[0]} {size[1]} {counts}")
+    lines.append(f"0 10000 10 {size[0]} {size[1]} {counts}")
+    write(tmp_path / "mots" / name, "\n".join(lines))
+    whole = open_dataset("tracking", tmp_path, kitti / "detections", kitti / "masks").load("000001").detections
+    for masks in (tmp_path / "mots", tmp_path / "mots" / name):
+        dataset = open_dataset("tracking", tmp_path, kitti / "detections", masks, tracks=True)
+        found = dataset.load("000001").detections
+        assert found.mask_left.dense().equal(whole.mask_left.dense())
+        assert not found.has_mask_right.any()
+        assert found.track_id is not None
+        assert found.track_id.tolist() == [3, 4]
+        assert tmp_path / "mots" / name in dataset.input_files("000001").values()
+    write(tmp_path / "mots" / name, "0 1003 1 120 160")
+    with pytest.raises(DataFormatError, match=r"line 1: expected five whole numbers and run lengths, got 5 words"):
+        open_dataset("tracking", tmp_path, kitti / "detections", tmp_path / "mots").load("000000")
+
+
+def test_text_masks_of_several_sequences(kitti: Path, tmp_path: Path) -> None:
+    write_sequence(kitti, tmp_path, FRAMES, single=False)
+    write_tracked(kitti / "detections" / "data", FRAMES, tmp_path / "results" / f"{SEQUENCE}.txt")
+    entry = json.loads((kitti / "masks" / f"{FRAMES[1]}.json").read_text())[0]["segmentation"]
+    write(tmp_path / "mots" / f"{SEQUENCE}.txt", f"1 1007 1 {entry['size'][0]} {entry['size'][1]} {entry['counts']}")
+    write(tmp_path / "mots" / "0099.txt", "nothing of this sequence")
+    dataset = open_dataset("tracking", tmp_path, tmp_path / "results", tmp_path / "mots")
+    assert [int(dataset.load(f"{SEQUENCE}_{name}").detections.has_mask_left.sum()) for name in FRAMES] == [0, 1]
+
+
 def test_stereo2015(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
     write_stereo2015(kitti, tmp_path, FRAMES)
     detections, masks = renamed(kitti, tmp_path, ("000000_11", "000001"))
@@ -165,9 +274,10 @@ def test_another_layout_is_refused_with_the_cure(layout: LayoutName, kitti: Path
 def test_wrong_words_and_folders_that_are_not_there(kitti: Path, tmp_path: Path) -> None:
     detections = kitti / "detections"
     cases: list[tuple[str, Path, Path | None, str]] = [
-        ("coco", kitti, None, "layout: expected one of kitti, raw, tracking, stereo2015, folder, got 'coco'"),
+        ("coco", kitti, None, "layout: expected one of kitti, raw, tracking, odometry, stereo2015, folder, got 'coco'"),
         ("kitti", kitti, None, "detections: expected a folder of detections for the layout 'kitti', got none"),
-        ("kitti", kitti / "training", detections, "holds no folder 'training' in KITTI's layout"),
+        ("kitti", kitti / "masks", detections, "holds no image_2, training/image_2 or testing/image_2 in KITTI's"),
+        ("odometry", kitti, detections, r"holds no \[dataset/\]sequences/NN/image_2 as KITTI's odometry data"),
         ("kitti", kitti, kitti / "nowhere", "nowhere: is no folder of detections"),
         ("kitti", kitti, tmp_path, r"frames: expected at least one detection file NNNNNN\.txt in"),
     ]

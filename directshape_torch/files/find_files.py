@@ -1,0 +1,77 @@
+"""Find the files that a user means, whatever the capitals of their endings and the spelling of their accents."""
+
+from __future__ import annotations
+
+import os
+import time
+import unicodedata
+from collections.abc import Iterable
+from functools import lru_cache
+from pathlib import Path
+
+# File systems note the time of a change in steps: a folder that changed just now may change again unseen.
+_SURELY_PAST_S = 2.0
+
+
+def found(path: Path) -> Path | None:
+    """A file by its name; else the one whose ending has other capitals, or whose letters are composed otherwise.
+
+    macOS writes an accent and its letter apart, other systems together; cameras write `.JPG`. Of several the first in
+    order is taken. None: there is no such file.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = (Path(folder) / "000000.PNG").write_bytes(b"")
+        ...     found(Path(folder) / "000000.png").name
+        '000000.PNG'
+    """
+    if path.is_file():
+        return path
+    name = _names(path.parent).get(_key(path.name))
+    return None if name is None or not (path.parent / name).is_file() else path.parent / name
+
+
+def is_called(path: Path, names: Iterable[str]) -> bool:
+    """Whether a file has one of some names, without its ending and however accents are written."""
+    return unicodedata.normalize("NFC", path.stem) in {unicodedata.normalize("NFC", name) for name in names}
+
+
+def visible_files(folder: Path, endings: Iterable[str]) -> list[Path]:
+    """The files of a folder with one of some endings, such as ".txt", in whatever capitals, sorted by name.
+
+    Names that begin with a dot are no user's: macOS puts a `._NAME` beside each file that it copies.
+    """
+    wanted = frozenset(endings)
+    names = sorted(name for name in _names(folder).values() if Path(name).suffix.lower() in wanted)
+    return [folder / name for name in names if (folder / name).is_file()]
+
+
+def _names(folder: Path) -> dict[str, str]:
+    """The visible names in a folder by `_key`; nothing where there is no folder."""
+    try:
+        changed_ns = folder.stat().st_mtime_ns
+    except OSError:
+        return {}
+    if time.time() - changed_ns / 1e9 < _SURELY_PAST_S:
+        return _listed(folder)
+    return _remembered(folder, changed_ns)
+
+
+@lru_cache(maxsize=64)
+def _remembered(folder: Path, _changed_ns: int) -> dict[str, str]:
+    return _listed(folder)
+
+
+def _listed(folder: Path) -> dict[str, str]:
+    try:
+        names = sorted(os.listdir(folder), reverse=True)
+    except OSError:
+        return {}
+    return {_key(name): name for name in names if not name.startswith(".")}
+
+
+def _key(name: str) -> str:
+    """A name as all spellings of it are: letters composed, the ending in small ones."""
+    stem, ending = os.path.splitext(unicodedata.normalize("NFC", name))
+    return stem + ending.lower()
