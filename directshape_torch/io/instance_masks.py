@@ -154,7 +154,8 @@ def decode_segmentation(path: Path, where: str, segmentation: Any, size_hw: tupl
 
     Args:
         path, where: the file and the entry's place in it, named in errors.
-        segmentation: RLE `{"size": [H, W], "counts": str | bytes | list}`, or polygons `[x0, y0, x1, y1, ..]`.
+        segmentation: RLE `{"size": [H, W], "counts": str | bytes | list}`, or polygons `[x0, y0, x1, y1, ..]`, of which
+            those without an area (less than three points) and None show nothing.
         size_hw: size of the image.
 
     Raises:
@@ -172,8 +173,12 @@ def decode_segmentation(path: Path, where: str, segmentation: Any, size_hw: tupl
             raise DataFormatError(path, f"{where}: bad run lengths ('size' is {shown(size)}, expected [height, width])")
         check_size(path, f"{where}: the mask", size, size_hw)
         return _from_runs(path, where, segmentation["counts"], size_hw)
-    if isinstance(segmentation, list) and segmentation and _are_polygons(segmentation):
-        return _from_runs(path, where, _outlined(path, where, segmentation, size_hw), size_hw)
+    if segmentation is None or (isinstance(segmentation, list) and all(map(_is_polygon, segmentation))):
+        # Tools write down outlines of one or two points, and nothing at all, for what has no area.
+        with_area = [polygon for polygon in segmentation or [] if len(polygon) >= 6 and len(polygon) % 2 == 0]
+        if not with_area:
+            return np.zeros(size_hw, dtype=bool)
+        return _from_runs(path, where, _outlined(path, where, with_area, size_hw), size_hw)
     raise DataFormatError(
         path,
         f"{where}: 'segmentation' is neither RLE nor a list of polygons",
@@ -200,14 +205,20 @@ def _from_runs(path: Path, where: str, counts: Any, size_hw: tuple[int, int]) ->
 def _runs(counts: Any) -> Sequence[int]:
     """Run lengths as numbers of at least 0; `ValueError` where they are something else."""
     if isinstance(counts, (str, bytes)):
-        runs = _run_lengths(counts.encode("ascii") if isinstance(counts, str) else counts)
-    elif isinstance(counts, list) and all(map(_is_whole, counts)):
-        runs = counts
+        runs = _run_lengths(_unprinted(counts).encode("ascii") if isinstance(counts, str) else counts)
+    elif isinstance(counts, list) and all(_is_number(run) and float(run).is_integer() for run in counts):
+        runs = [int(run) for run in counts]
     else:
         raise ValueError(f"'counts' is {shown(counts)}, expected text or a list of whole numbers")
     if min(runs, default=0) < 0:
         raise ValueError(f"a run of {min(runs)} pixels")
     return runs
+
+
+def _unprinted(counts: str) -> str:
+    """The text itself; of bytes that were printed into a text what they hold: the encoding has no quotation marks."""
+    is_printed = counts.startswith(("b'", 'b"')) and counts.endswith(("'", '"'))
+    return counts[2:-1].replace("\\\\", "\\") if is_printed else counts
 
 
 def _outlined(path: Path, where: str, polygons: Sequence[Sequence[float]], size_hw: tuple[int, int]) -> bytes:
@@ -250,11 +261,8 @@ def _run_lengths(data: bytes) -> list[int]:
     return runs
 
 
-def _are_polygons(segmentation: list[Any]) -> bool:
-    return all(
-        isinstance(polygon, list) and len(polygon) >= 6 and len(polygon) % 2 == 0 and all(map(_is_number, polygon))
-        for polygon in segmentation
-    )
+def _is_polygon(polygon: Any) -> bool:
+    return isinstance(polygon, list) and all(map(_is_number, polygon))
 
 
 def _is_number(value: Any) -> bool:

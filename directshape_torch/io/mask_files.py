@@ -273,6 +273,10 @@ def _from_coco(
         if side not in SIDES:
             raise DataFormatError(path, f"entry {index}: 'image' is {shown(side)}, expected 'left' or 'right'")
         soft, where = entry.get("soft_probability"), f"entry {index}"
+        if not soft and "segmentation" not in entry:
+            raise DataFormatError(
+                path, f"{where} has no 'segmentation'", cure="write RLE or polygons, as COCO results do"
+            )
         # Run lengths alone, without their size, are text too, and no path.
         probability = (
             read_mask(path, where, str(soft), size_hw, path.parent)

@@ -34,7 +34,7 @@ NAN, INF = float("nan"), float("inf")
     [
         *([[1, 1, 5, 1, 5, corner]] for corner in (None, NAN, INF, -INF, 1e8, -1e300, 10**17, True, "5", [5])),
         [[0, 0, 9e5, 9e5] * 40000],
-        *({"size": list(SIZE_HW), "counts": counts} for counts in ([4800.0], [4799.5, 0.5], [-1, 4801], [None], [[]])),
+        *({"size": list(SIZE_HW), "counts": counts} for counts in ([4801.0], [4799.5, 0.5], [-1, 4801], [None], [[]])),
         *({"size": list(SIZE_HW), "counts": counts} for counts in (10**12, {}, "\u00e9", "o" * 10**6, "", b"")),
         *({"size": size, "counts": [4800]} for size in ([60.0, 80], [80, 60], [2**31, 2**31], [None, 80], 4800, "xy")),
         {"size": [92681, 92681], "counts": [92681 * 92681]},

@@ -48,9 +48,12 @@ def write_json(path: Path, content: Any) -> Path:
         {"size": list(SIZE_HW), "counts": RUNS},
         {"size": list(SIZE_HW), "counts": encoded(MASK)},
         {"size": list(SIZE_HW), "counts": encoded(MASK).encode()},
+        {"size": list(SIZE_HW), "counts": str(encoded(MASK).encode())},
+        {"size": list(SIZE_HW), "counts": [float(run) for run in RUNS]},
+        [[], [1, 1, 2, 2], [4, 1, 6, 1, 6, 4, 4, 4], [3, 3, 5, 5, 7]],
         [[4, 1, 6, 1, 6, 4, 4, 4]],
     ],
-    ids=["list", "text", "bytes", "polygon"],
+    ids=["list", "text", "bytes", "printed bytes", "whole floats", "polygons with and without area", "polygon"],
 )
 def test_segmentation_forms(segmentation: Any) -> None:
     np.testing.assert_array_equal(decode_segmentation(Path("a.json"), "entry 0", segmentation, SIZE_HW), MASK)
@@ -67,8 +70,9 @@ def test_compressed_masks_of_any_content_pass_the_check(seed: int, height: int, 
 @pytest.mark.parametrize(
     ("segmentation", "message"),
     [
-        (None, "entry 7: 'segmentation' is neither RLE nor a list of polygons"),
-        ([[1, 2]], "neither RLE nor a list"),
+        (7, "entry 7: 'segmentation' is neither RLE nor a list of polygons"),
+        ([["a", "b"]], "neither RLE nor a list"),
+        ({"size": [6, 9], "counts": [25.5, 28.5]}, "bad run lengths"),
         ({"size": [6, 9], "counts": [25, 3]}, "entry 7: run lengths cover 28 pixels, expected 6 x 9 = 54"),
         ({"size": [6, 9], "counts": encoded(MASK)[:-2]}, r"entry 7: run lengths cover \d+ pixels"),
         ({"size": [6, 9], "counts": "~~"}, "entry 7: bad run lengths .*'~' is not part"),
@@ -112,9 +116,14 @@ def test_soft_probability_replaces_the_binary_mask(tmp_path: Path) -> None:
     assert source.files("000000") == (tmp_path / "000000.json", tmp_path / "soft" / "a.png")
 
 
-def test_empty_mask_is_no_instance(tmp_path: Path) -> None:
-    write_json(tmp_path / "000000.json", [entry(image="left", segmentation={"size": [6, 9], "counts": [54]})])
-    assert FrameJsonMasks(tmp_path).read("000000", SIZE_HW) == []
+@pytest.mark.parametrize(
+    "nothing", [{"size": [6, 9], "counts": [54]}, [], [[]], None, [[1, 1, 3, 3]], [[1, 1, 3, 3, 5]], [[], [2, 2]]]
+)
+def test_an_empty_mask_is_no_instance_and_harms_no_other(tmp_path: Path, nothing: Any) -> None:
+    """Tools write such entries for what has no area."""
+    write_json(tmp_path / "000000.json", [entry(image="left", segmentation=nothing), entry(image="left")])
+    (mask,) = FrameJsonMasks(tmp_path).read("000000", SIZE_HW)
+    assert mask.mask_box == (4, 1, 5, 3)
 
 
 @pytest.mark.parametrize(
@@ -130,6 +139,7 @@ def test_empty_mask_is_no_instance(tmp_path: Path) -> None:
             r"000000\.json: entry 0: 'segmentation' is neither RLE nor",
         ),
         ([entry(image="left", score="high")], "entry 0: bad or missing field"),
+        ([{"image": "left", "category_id": 3}], "entry 0 has no 'segmentation'"),
         (
             [entry(image="left", segmentation={"size": [9, 6], "counts": RUNS})],
             r"000000\.json: entry 0: the mask has 6 x 9 pixels \(width x height\), its image 9 x 6",
