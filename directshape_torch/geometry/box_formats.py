@@ -6,17 +6,19 @@
 | `mmdet3d_camera` | camera | bottom centre | l h w | as KITTI |
 | `opencv` | camera | centre | l w h | as KITTI |
 | `mmdet3d_lidar` | LiDAR | bottom centre | l w h | 0 along x (forward), pi/2 along y (left) |
+| `openpcdet` | LiDAR | centre | l w h (dx dy dz) | as `mmdet3d_lidar` |
 | `nuscenes` | LiDAR, ego or global | centre | w l h | 0 along x, pi/2 along y |
 
 Camera frames have x right, y down, z forward; in the others z is up, and where x points is their own matter:
-forward for `mmdet3d_lidar`, to the right in nuScenes' LIDAR_TOP. MMDetection3D is that of version 1.0 and later, where
-headings changed. Corners are in the order of each tool: KITTI's devkit (and `opencv`), MMDetection3D's `corners`,
-nuScenes' `Box.corners()`, transposed to (8, 3). KITTI's "ref" is a camera frame beside the left one:
-`T_cam_boxes=camera.T_cam_ref`.
+forward for `mmdet3d_lidar` and `openpcdet`, to the right in nuScenes' LIDAR_TOP. MMDetection3D is that of version 1.0
+and later, where headings changed. Corners are in the order of each tool: KITTI's devkit (and `opencv`), MMDetection3D's
+`corners`, OpenPCDet's `boxes_to_corners_3d`, nuScenes' `Box.corners()`, transposed to (8, 3). KITTI's "ref" is a camera
+frame beside the left one: `T_cam_boxes=camera.T_cam_ref`.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -26,14 +28,16 @@ from torch import Tensor
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import rotation_about_y
-from directshape_torch.numerics.checks import check_rotation, check_shape
+from directshape_torch.numerics.checks import check_rotation, check_rows, check_shape
 
-BoxFormat = Literal["kitti", "mmdet3d_camera", "mmdet3d_lidar", "nuscenes", "opencv"]
+BoxFormat = Literal["kitti", "mmdet3d_camera", "mmdet3d_lidar", "openpcdet", "nuscenes", "opencv"]
 # Corners that were rounded to centimetres still make a box, those in another order do not.
 _CORNER_TOLERANCE_M = 0.05
 # Axes of the object frame (x forward, y down, z left) in those of a box whose z is up (x forward, y left).
 _OBJ_IN_UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
-# Corners along the object's x, y and z: 1 at the front, the ground, the left of travel.
+# Cosine of the largest angle by which boxes lean: no camera on a car leans by 60 degrees.
+_LEAST_UPRIGHT = 0.5
+# Corners along the object's x, y and z: 1 at the front, the ground, the left of travel. OpenPCDet's order is KITTI's.
 _DEVKIT = ((1, 1, 1), (1, 1, -1), (-1, 1, -1), (-1, 1, 1), (1, -1, 1), (1, -1, -1), (-1, -1, -1), (-1, -1, 1))
 _MMDET3D_CAMERA = ((-1, -1, -1), (-1, -1, 1), (-1, 1, 1), (-1, 1, -1), (1, -1, -1), (1, -1, 1), (1, 1, 1), (1, 1, -1))
 _MMDET3D_LIDAR = ((-1, 1, -1), (-1, -1, -1), (-1, -1, 1), (-1, 1, 1), (1, 1, -1), (1, -1, -1), (1, -1, 1), (1, 1, 1))
@@ -41,7 +45,7 @@ _NUSCENES = ((1, -1, 1), (1, -1, -1), (1, 1, -1), (1, 1, 1), (-1, -1, 1), (-1, -
 
 
 @dataclass(frozen=True)
-class _Format:
+class BoxForm:
     """How a tool writes boxes.
 
     Attributes:
@@ -49,20 +53,45 @@ class _Format:
         raised: share of the height by which the location lies above the bottom.
         upright: z is up; else a camera's axes.
         corners: signs along the object's axes.
+        frame: its axes, in words.
+        heading: what its heading counts, in words.
+        heading_of_right: heading of a car that drives to the right of a camera that looks ahead, radians.
     """
 
     sizes: str
     raised: float
     upright: bool
     corners: tuple[tuple[int, int, int], ...]
+    frame: str
+    heading: str
+    heading_of_right: float = 0.0
+
+    @property
+    def place(self) -> str:
+        """Which point of a box its location is."""
+        return "the centre of the box" if self.raised else "the centre of the box's bottom face"
+
+    @property
+    def order(self) -> str:
+        """The three sizes, in their order."""
+        names = {"h": "height", "w": "width", "l": "length"}
+        return ", ".join(names[size] for size in self.sizes)
 
 
-_FORMATS: dict[str, _Format] = {
-    "kitti": _Format("hwl", 0.0, False, _DEVKIT),
-    "mmdet3d_camera": _Format("lhw", 0.0, False, _MMDET3D_CAMERA),
-    "mmdet3d_lidar": _Format("lwh", 0.0, True, _MMDET3D_LIDAR),
-    "nuscenes": _Format("wlh", 0.5, True, _NUSCENES),
-    "opencv": _Format("lwh", 0.5, False, _DEVKIT),
+_CAMERA = "x right, y down, z forward, metres, in the frame of the rectified left camera"
+_LIDAR = "x forward, y left, z up, metres, in the frame of the LiDAR that T_cam_boxes takes to the left camera"
+_UP = "z up, metres, in the frame that T_cam_boxes takes to the left camera"
+_ABOUT_Y = (
+    "in radians about the y axis, 0 where the car drives along +x (right), -pi/2 where it drives along +z (ahead)"
+)
+_ABOUT_Z = "in radians about the z axis, 0 where the car drives along +x, pi/2 where it drives along +y"
+_FORMS: dict[str, BoxForm] = {
+    "kitti": BoxForm("hwl", 0.0, False, _DEVKIT, _CAMERA, f"rotation_y {_ABOUT_Y}"),
+    "mmdet3d_camera": BoxForm("lhw", 0.0, False, _MMDET3D_CAMERA, _CAMERA, f"yaw {_ABOUT_Y}"),
+    "mmdet3d_lidar": BoxForm("lwh", 0.0, True, _MMDET3D_LIDAR, _LIDAR, f"yaw {_ABOUT_Z}", -math.pi / 2),
+    "openpcdet": BoxForm("lwh", 0.5, True, _DEVKIT, _LIDAR, f"heading {_ABOUT_Z}", -math.pi / 2),
+    "nuscenes": BoxForm("wlh", 0.5, True, _NUSCENES, _UP, f"yaw {_ABOUT_Z}"),
+    "opencv": BoxForm("lwh", 0.5, False, _DEVKIT, _CAMERA, f"heading {_ABOUT_Y}"),
 }
 
 
@@ -82,10 +111,9 @@ def boxes_to_poses(
         >>> hwl
         tensor([[1.5000, 1.6000, 4.0000]])
     """
-    form = _format(convention)
+    form = box_form(convention)
     if not isinstance(boxes, Tensor) or boxes.ndim != 3:
-        cure = "give x, y, z, three sizes and heading, or corners (N, 8, 3)"
-        check_shape("boxes", boxes, ("N", 7), cure, "floating")
+        check_shape("boxes", boxes, ("N", 7), _cure_of_shape(boxes, convention), "floating")
         T_boxes_obj, hwl = _from_numbers(boxes, form)
     else:
         check_shape("boxes", boxes, ("N", 8, 3), kind="floating")
@@ -110,7 +138,7 @@ def poses_to_boxes(
         >>> poses_to_boxes(T_cam_obj, hwl, "opencv")
         tensor([[ 1.0000,  0.8500, 20.0000,  4.0000,  1.6000,  1.5000,  0.3000]])
     """
-    form = _format(convention)
+    form = box_form(convention)
     T = _to_camera(T_cam_boxes, convention, T_cam_obj)
     T_boxes_obj = T_cam_obj if T is None else se3.inverse(T) @ T_cam_obj
     up = -T_boxes_obj[:, :3, 1]
@@ -121,26 +149,54 @@ def poses_to_boxes(
     return torch.cat([location, sizes, heading[:, None]], dim=1)
 
 
-def _format(convention: str) -> _Format:
-    if not isinstance(convention, str) or convention not in _FORMATS:
+def box_form(convention: str) -> BoxForm:
+    """How boxes of a convention are written, with words for it.
+
+    Raises:
+        InputError: an unknown convention.
+    """
+    if not isinstance(convention, str) or convention not in _FORMS:
         raise InputError("convention", f"one of {', '.join(get_args(BoxFormat))}", repr(convention))
-    return _FORMATS[convention]
+    return _FORMS[convention]
 
 
 def is_z_up(convention: BoxFormat) -> bool:
     """Whether z is up in the frame of a format, and headings turn about it; else they turn about y, which is down."""
-    return _format(convention).upright
+    return box_form(convention).upright
+
+
+def check_upright(T_cam_boxes: Tensor, convention: BoxFormat) -> None:
+    """Raise `InputError` where a motion (4, 4) or (N, 4, 4) to the camera does not take up to up, as its inverse."""
+    form = box_form(convention)
+    axis, name, sign = (2, "z", 1.0) if form.upright else (1, "y", -1.0)
+    R = T_cam_boxes.detach().reshape(-1, 4, 4)[:, :3, :3]
+    leans = -sign * R[:, 1, axis] < _LEAST_UPRIGHT
+    expected = (
+        f"the motion from the frame of {convention!r} boxes ({form.frame.split(', metres')[0]}) to the left camera "
+        f"(x right, y down, z forward), which takes their {name} axis {'up' if form.upright else 'down'}"
+    )
+    cure = "give camera_from_boxes, not its inverse boxes_from_camera, with the camera's axes"
+    check_rows("T_cam_boxes", leans, R, expected, cure)
+
+
+def _cure_of_shape(boxes: object, convention: str) -> str:
+    order = f"give x, y, z, {box_form(convention).order} and heading, or corners (N, 8, 3)"
+    if isinstance(boxes, Tensor) and boxes.ndim == 2 and boxes.shape[1] > 7:
+        return f"{order}; leave out velocities and scores: boxes[:, :7]"
+    return order
 
 
 def _to_camera(T_cam_boxes: Tensor | None, convention: str, like: Tensor) -> Tensor | None:
     if T_cam_boxes is None:
-        if not _FORMATS[convention].upright:
+        if not _FORMS[convention].upright:
             return None
+        nuscenes = "take it from the calibrated_sensor entries of LiDAR and camera (and ego_pose for global boxes)"
+        kitti = "with KITTI's calibration camera.T_cam_ref @ R0_rect @ Tr_velo_to_cam, as (4, 4) each"
         raise InputError(
             "T_cam_boxes",
             f"the rigid motion camera_from_lidar, (4, 4): {convention!r} boxes are not in the camera frame",
             "None",
-            "KITTI: R0_rect @ Tr_velo_to_cam, then camera.T_cam_ref; nuScenes: from its calibrated_sensor entries",
+            nuscenes if convention == "nuscenes" else kitti,
         )
     shape = (4, 4) if isinstance(T_cam_boxes, Tensor) and T_cam_boxes.ndim == 2 else (len(like), 4, 4)
     check_shape("T_cam_boxes", T_cam_boxes, shape, "give one motion, or one for each box", "floating")
@@ -148,7 +204,7 @@ def _to_camera(T_cam_boxes: Tensor | None, convention: str, like: Tensor) -> Ten
     return T_cam_boxes.to(like)
 
 
-def _from_numbers(boxes: Tensor, form: _Format) -> tuple[Tensor, Tensor]:
+def _from_numbers(boxes: Tensor, form: BoxForm) -> tuple[Tensor, Tensor]:
     location, sizes, heading = boxes[:, :3], boxes[:, 3:6], boxes[:, 6]
     hwl = sizes[:, [form.sizes.index(size) for size in "hwl"]]
     if form.upright:
@@ -160,21 +216,40 @@ def _from_numbers(boxes: Tensor, form: _Format) -> tuple[Tensor, Tensor]:
     return se3.from_rotation_translation(R, bottom), hwl
 
 
-def _from_corners(corners: Tensor, form: _Format, convention: str) -> tuple[Tensor, Tensor]:
+def _half_edges(corners: Tensor, form: BoxForm) -> tuple[Tensor, Tensor, Tensor]:
+    """Half edges (N, 3, 3) of corners (N, 8, 3), rows along the object's x, y, z; how far corners are from such a box
+    (N,), metres; and where they are none that stands (N,)."""
     sign = corners.new_tensor(form.corners)
-    centre = corners.mean(dim=1)
-    half = torch.einsum("nci,ck->nki", corners, sign) / 8  # half edges, rows along the object's x, y, z
-    error = (corners - centre[:, None] - sign @ half).norm(dim=-1).amax(dim=1)
+    half = torch.einsum("nci,ck->nki", corners, sign) / 8
+    error = (corners - corners.mean(dim=1, keepdim=True) - sign @ half).norm(dim=-1).amax(dim=1)
     askew = (half @ half.mT / half.square().sum(dim=(1, 2), keepdim=True)).triu(1).abs().amax(dim=(1, 2))
     left_handed = torch.linalg.det(half.double()) < 0
     # Another tool's order turns a box by right angles, which makes a box again: mostly one on its side.
     height = half[:, 1] if not form.upright else -half[:, 1]
     rises = height[:, 2 if form.upright else 1] / height.norm(dim=1)
-    wrong = (error > _CORNER_TOLERANCE_M) | (askew > 0.02) | left_handed | (rises < 0.5)
+    return half, error, (error > _CORNER_TOLERANCE_M) | (askew > 0.02) | left_handed | (rises < _LEAST_UPRIGHT)
+
+
+def _cure_of_corners(corners: Tensor, convention: str) -> str:
+    """The order in words, and the conventions in whose order and frame the corners (8, 3) of a box would be."""
+    others = [name for name, form in _FORMS.items() if not _half_edges(corners[None], form)[2].item()]
+    if others:
+        return f"they are in the order of {' or '.join(map(repr, others))}: give that convention"
+    words = (("rear", "front"), ("top", "bottom"), ("right", "left"))
+    order = [
+        " ".join(pair[sign > 0] for pair, sign in zip(words, corner, strict=True))
+        for corner in _FORMS[convention].corners
+    ]
+    return f"give them as {', '.join(order)}, as seen by the driver"
+
+
+def _from_corners(corners: Tensor, form: BoxForm, convention: str) -> tuple[Tensor, Tensor]:
+    centre = corners.mean(dim=1)
+    half, error, wrong = _half_edges(corners, form)
     if wrong.any():
         row = int(wrong.int().argmax())
         got = f"corners {error[row]:.2f} m from a box, or of a box turned inside out or on its side, in row {row}"
-        cure = "see the order of corners in directshape_torch.geometry.box_formats"
+        cure = _cure_of_corners(corners[row], convention)
         raise InputError("boxes", f"corners in the order of {convention!r}", got, cure)
     length_height_width = 2 * half.norm(dim=2)
     # The nearest rotation, as corners are rounded; none of numbers that are not finite, or where an edge has no length.

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from directshape_torch.errors import InputError
-from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses, poses_to_boxes
+from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
+from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses, check_upright, poses_to_boxes
 
 # LiDAR (x forward, y left, z up) 0.3 m above and 0.2 m behind the camera.
 T_CAM_LIDAR = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, -0.3], [1, 0, 0, -0.2], [0, 0, 0, 1]], dtype=torch.float64)
@@ -24,9 +24,10 @@ WRITTEN: dict[BoxFormat, list[float]] = {
     "mmdet3d_camera": [-3.0, 1.7, 20.0, 4.0, 1.5, 1.6, KITTI_YAW],
     "opencv": [-3.0, 0.95, 20.0, 4.0, 1.6, 1.5, KITTI_YAW],
     "mmdet3d_lidar": [20.2, 3.0, -2.0, 4.0, 1.6, 1.5, 0.2],
+    "openpcdet": [20.2, 3.0, -1.25, 4.0, 1.6, 1.5, 0.2],
     "nuscenes": [-3.0, 20.2, -1.25, 1.6, 4.0, 1.5, math.pi / 2 + 0.2],
 }
-MOTION = {"mmdet3d_lidar": T_CAM_LIDAR, "nuscenes": T_CAM_TOP}
+MOTION = {"mmdet3d_lidar": T_CAM_LIDAR, "openpcdet": T_CAM_LIDAR, "nuscenes": T_CAM_TOP}
 
 
 def expected() -> torch.Tensor:
@@ -58,6 +59,12 @@ def tools_corners(convention: BoxFormat) -> torch.Tensor:
     if convention == "mmdet3d_lidar":
         local = (unravelled - torch.tensor([0.5, 0.5, 0.0])) * torch.tensor(sizes)
         return local.double() @ about_z.T + at
+    if convention == "openpcdet":  # boxes_to_corners_3d of pcdet/utils/box_utils.py
+        template = torch.tensor(
+            [[1, 1, -1], [1, -1, -1], [-1, -1, -1], [-1, 1, -1], [1, 1, 1], [1, -1, 1], [-1, -1, 1], [-1, 1, 1]]
+        )
+        local = template / 2 * torch.tensor(sizes)
+        return local.double() @ about_z.T + at
     if convention == "nuscenes":
         w, length, h = sizes
         xs = length / 2 * torch.tensor([1.0, 1, 1, 1, -1, -1, -1, -1])
@@ -79,6 +86,59 @@ def test_corners_are_read_in_each_tools_own_order(convention: BoxFormat) -> None
     torch.testing.assert_close(hwl, torch.tensor([HWL]).double(), atol=1e-6, rtol=0)
     rounded, _ = boxes_to_poses((corners * 100).round() / 100, convention, MOTION.get(convention))
     torch.testing.assert_close(rounded, expected(), atol=0.02, rtol=0)
+
+
+def test_openpcdets_box_has_these_corners_by_hand() -> None:
+    """A car that drives to the left of the LiDAR: its front is 2 m farther left, its right side 0.8 m farther ahead."""
+    boxes = torch.tensor([[20.0, 3.0, -1.0, 4.0, 1.6, 1.5, math.pi / 2]], dtype=torch.float64)
+    T_lidar_obj, hwl = boxes_to_poses(boxes, "openpcdet", torch.eye(4))
+    corners = box_corners(T_lidar_obj, hwl)[0]
+    front_left, front_right, rear_right = [19.2, 5.0, -1.75], [20.8, 5.0, -1.75], [20.8, 1.0, -1.75]
+    torch.testing.assert_close(corners[:3], torch.tensor([front_left, front_right, rear_right]).double())
+    torch.testing.assert_close(corners[4:, 2], torch.full((4,), -0.25).double())
+
+
+def test_openpcdet_and_mmdetection3d_differ_by_half_a_height() -> None:
+    box = torch.tensor([WRITTEN["mmdet3d_lidar"]], dtype=torch.float64)
+    raised = box + box.new_tensor([0, 0, 0.75, 0, 0, 0, 0])
+    poses = [boxes_to_poses(*given, T_CAM_LIDAR)[0] for given in ((box, "mmdet3d_lidar"), (raised, "openpcdet"))]  # type: ignore[arg-type]
+    torch.testing.assert_close(*poses)
+
+
+# The same order and axes, or corners that make another standing box in the other frame.
+_BOXES_IN_BOTH = {
+    *(("kitti", "opencv"), ("opencv", "kitti"), ("kitti", "nuscenes"), ("opencv", "nuscenes"), ("nuscenes", "kitti")),
+    *(("nuscenes", "opencv"), ("mmdet3d_camera", "openpcdet"), ("mmdet3d_lidar", "mmdet3d_camera")),
+}
+
+
+@pytest.mark.parametrize(("written", "read"), [(a, b) for a in WRITTEN for b in WRITTEN])
+def test_corners_of_another_tool_are_told_by_its_name(written: BoxFormat, read: BoxFormat) -> None:
+    corners = tools_corners(written)[None]
+    if written == read or (written, read) in _BOXES_IN_BOTH:
+        boxes_to_poses(corners, read, MOTION.get(read))
+        return
+    with pytest.raises(InputError, match=f"in the order of '{read}'.*they are in the order of .*'{written}'"):
+        boxes_to_poses(corners, read, MOTION.get(read))
+
+
+@pytest.mark.parametrize("convention", WRITTEN)
+def test_shapes_and_motions_are_refused_in_the_words_of_the_convention(convention: BoxFormat) -> None:
+    order = {
+        "kitti": "height, width, length",
+        "mmdet3d_camera": "length, height, width",
+        "opencv": "length, width, height",
+        "mmdet3d_lidar": "length, width, height",
+        "openpcdet": "length, width, height",
+        "nuscenes": "width, length, height",
+    }[convention]
+    with pytest.raises(InputError, match=rf"shape \(N, 7\), got \(2, 9\); give x, y, z, {order} and heading, .*:7\]"):
+        boxes_to_poses(torch.zeros(2, 9), convention, MOTION.get(convention))
+    right_one = MOTION.get(convention, torch.eye(4).double())
+    check_upright(right_one, convention)
+    inverse = right_one.inverse() if convention in MOTION else T_CAM_LIDAR
+    with pytest.raises(InputError, match=rf"T_cam_boxes: expected the motion from the frame of '{convention}' boxes"):
+        check_upright(inverse, convention)
 
 
 def test_corners_in_another_order_are_refused() -> None:
@@ -109,8 +169,12 @@ def test_corners_of_no_box_make_no_pose_and_leave_the_others_alone() -> None:
 
 def test_lidar_boxes_need_the_motion_to_the_camera() -> None:
     boxes = torch.tensor([WRITTEN["nuscenes"]])
-    with pytest.raises(InputError, match=r"T_cam_boxes: expected the rigid motion camera_from_lidar.* got None; KITTI"):
+    with pytest.raises(
+        InputError, match=r"T_cam_boxes: expected the rigid motion camera_from_lidar.* got None; .* calibr"
+    ):
         boxes_to_poses(boxes, "nuscenes")
+    with pytest.raises(InputError, match=r"got None; with KITTI's calibration camera.T_cam_ref @ R0_rect @ Tr_velo"):
+        boxes_to_poses(boxes, "openpcdet")
     with pytest.raises(InputError, match="T_cam_boxes: expected shape"):
         boxes_to_poses(boxes, "nuscenes", T_CAM_TOP[:3])
     with pytest.raises(InputError, match="T_cam_boxes: expected rotations"):
