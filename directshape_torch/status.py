@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -11,8 +12,11 @@ from torch import Tensor
 class Status(enum.Enum):
     """Outcome for one car. `converged` and `max_iterations` carry a refined state; all others the input's."""
 
-    converged = "the cost settled, or a further step promises less than half a percent of it"
-    max_iterations = "the iterations ran out before the cost settled; the state is the best one found"
+    converged = "refined: the cost settled, or a further step promises less than half a percent of it"
+    max_iterations = (
+        "refined: the iterations were used up while the cost still fell a little; such cars gain nearly as much as "
+        "converged ones, and more iterations would change them little"
+    )
     no_mask = "the car has no instance mask in the left image, which is needed; check the masks and their frame numbers"
     too_few_pixels = "fewer usable pixels than the configured minimum; the car is tiny, cut off or hidden"
     behind_camera = "the initial box lies behind or at the camera, or upside down; check frame and units of the pose"
@@ -52,3 +56,19 @@ _REFINED = [status.code for status in Status if status.is_refined]
 def is_refined(status_code: Tensor) -> Tensor:
     """Which codes (B,) are of cars that carry a refined state."""
     return torch.stack([status_code == code for code in _REFINED]).any(dim=0)
+
+
+def counted(counts: Mapping[str, int]) -> str:
+    """How many cars ended in which way, by names of statuses: the refined ones first, for both names are successes.
+
+    Examples:
+        >>> counted({"max_iterations": 1, "converged": 4, "no_mask": 2})
+        '5 refined (converged 4, max_iterations 1), 2 as before (no_mask 2)'
+    """
+    parts = []
+    for what, refined in (("refined", True), ("as before", False)):
+        of_these = {each.name: counts.get(each.name, 0) for each in Status if each.is_refined == refined}
+        words = ", ".join(f"{name} {count}" for name, count in of_these.items() if count)
+        if words:
+            parts.append(f"{sum(of_these.values())} {what} ({words})")
+    return ", ".join(parts) or "none"

@@ -15,7 +15,7 @@ import torch
 
 from directshape_torch.compile import num_forms
 from directshape_torch.files.atomic_files import write_json
-from directshape_torch.status import Status
+from directshape_torch.status import Status, counted
 
 TIMINGS = "timings.json"
 TIMINGS_SCHEMA_VERSION = 1
@@ -224,10 +224,9 @@ def format_summary(summary: RunSummary) -> str:
     """What the program prints at the end of a run."""
     done, timings = len(summary.frames) - len(summary.failed), summary.timings
     earlier = f", {len(summary.resumed)} of them in an earlier run" if summary.resumed else ""
-    statuses = ", ".join(f"{name} {count}" for name, count in summary.statuses.items()) or "none"
     lines = [
         f"frames   {done} done{earlier}, {len(summary.failed)} failed",
-        f"cars     {summary.num_cars}: {statuses}",
+        f"cars     {summary.num_cars}: {counted(summary.statuses)}",
     ]
     if timings.ms_per_frame is not None:
         per_car = "" if timings.ms_per_car is None else f"{timings.ms_per_car:.0f} ms per car, "

@@ -26,7 +26,7 @@ from directshape_torch.refinement.quality import FitQuality, bundled_trust_model
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.shape.zero_level import sdf_to_mesh, zero_level_extents
-from directshape_torch.status import Status, is_refined
+from directshape_torch.status import Status, counted, is_refined
 
 if TYPE_CHECKING:
     import trimesh
@@ -194,7 +194,7 @@ class RefinementResult(CarRecord):
         """
         lines = [f"RefinementResult of {len(self)} cars ({self.T_cam_obj.dtype}, {self.T_cam_obj.device})"]
         counts = Counter(self.status).most_common()
-        lines.append(f"  {', '.join(f'{count} {status.name}' for status, count in counts) or 'no cars'}")
+        lines.append(f"  {counted(Counter(status.name for status in self.status)) if len(self) else 'no cars'}")
         lines += [f"  {status.name}: {status.value}" for status, _ in counts if not status.is_refined]
         if not len(self):
             return lines[0] + "\n" + lines[1]

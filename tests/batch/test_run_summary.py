@@ -69,7 +69,7 @@ def test_report(forms: int, compiling: str) -> None:
     assert summary.num_cars == 6
     lines = format_summary(summary).splitlines()
     assert lines[0] == "frames   2 done, 1 of them in an earlier run, 1 failed"
-    assert lines[1] == "cars     6: converged 5, no_mask 1"
+    assert lines[1] == "cars     6: 5 refined (converged 5), 1 as before (no_mask 1)"
     # 0.9 s over 6 cars and 3 frames.
     assert lines[2] == f"time     150 ms per car, 300 ms per frame (refinement only{compiling}, cpu)"
     assert lines[3].startswith("memory   ")
