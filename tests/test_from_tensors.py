@@ -70,6 +70,27 @@ def test_intrinsics_of_one_and_of_many_frames() -> None:
         StereoCamera.from_intrinsics(K.long(), 0.5)
 
 
+def test_projections_of_one_frame_and_their_mistakes() -> None:
+    """As a camera_info has them: K of the raw images beside P of the rectified ones."""
+    K = torch.tensor([[700.0, 0, 300], [0, 700, 90], [0, 0, 1]])
+    P_left = torch.cat([K, torch.zeros(3, 1)], dim=1)
+    P_right = torch.cat([K, torch.tensor([[-378.0], [0], [0]])], dim=1)
+    camera = StereoCamera.from_projections(P_left, P_right)
+    assert camera.baseline.tolist() == pytest.approx([0.54])
+    assert camera.K_right[0].equal(K)
+    with pytest.raises(InputError, match=r"P_left: expected shape \(3, 4\), got \(3, 3\); .* from_intrinsics"):
+        StereoCamera.from_projections(K, K)
+    for right in (P_left, 2 * P_left - P_right):
+        with pytest.raises(InputError, match=r"P_right: expected .*-fx baseline .* camera_info P\[0, 3\] is below 0"):
+            StereoCamera.from_projections(P_left, right)
+    with pytest.raises(InputError, match=r"P_right: .*swap P_left and P_right"):
+        StereoCamera.from_projections(P_right, P_left)
+    with pytest.raises(InputError, match=r"K: .*for projections P there is from_projections"):
+        StereoCamera.from_intrinsics(P_left, 0.54)
+    with pytest.raises(InputError, match=r"baseline_m: .*-P_right\[0, 3\] / P_right\[0, 0\]"):
+        StereoCamera.from_intrinsics(K, -0.54)
+
+
 def test_images_may_be_bytes() -> None:
     K = STREET.frames.camera.K_left[0].float()
     image = torch.randint(0, 256, (2, 3, 20, 30), dtype=torch.uint8)

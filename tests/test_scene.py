@@ -28,7 +28,7 @@ def test_a_flipped_baseline_is_refused() -> None:
     left = torch.cat([K, torch.zeros(3, 1)], dim=1)[None]
     right = torch.cat([K, torch.tensor([[378.0], [0.0], [0.0]])], dim=1)[None]
     with pytest.raises(
-        InputError, match=r"T_right_cam: expected a right camera to the right .* got baseline -0\.5400 m; swap"
+        InputError, match=r"P_right: expected fourth columns .* 378\.0.* in row 0; swap P_left and P_right"
     ):
         StereoCamera.from_projections(left, right)
     T_right_cam = torch.eye(4)[None].clone()

@@ -17,6 +17,7 @@ from directshape_torch.numerics.checks import (
     check_finite,
     check_positive,
     check_rotation,
+    check_rows,
     check_shape,
     check_type,
 )
@@ -61,7 +62,7 @@ class StereoCamera(TensorRecord):
                 "T_right_cam",
                 "a right camera to the right of the left one (positive baseline)",
                 f"baseline {self.baseline.min().item():.4f} m",
-                "swap the two cameras, or the sign of the baseline",
+                "swap the two cameras, or flip the sign of the translation: x_right = x_left + t has t_x = -baseline",
             )
 
     @classmethod
@@ -92,11 +93,13 @@ class StereoCamera(TensorRecord):
         K_left = _intrinsics("K", K)
         of_right = K_left if K_right is None else _intrinsics("K_right", K_right)
         if len(of_right) not in (1, len(K_left)):
-            raise InputError("K_right", f"one matrix, or {len(K_left)}", f"{len(of_right)}")
+            expected, cure = f"one matrix, or {len(K_left)} as K has", "give one K_right for all frames or one for each"
+            raise InputError("K_right", expected, f"{len(of_right)}", cure)
         if isinstance(baseline_m, Tensor):
             check_shape("baseline_m", baseline_m, (len(K_left),) if baseline_m.ndim else ())
         else:
-            check_positive("baseline_m", baseline_m, "in metres")
+            cure = "give the distance of the cameras in metres; of projections it is -P_right[0, 3] / P_right[0, 0]"
+            check_positive("baseline_m", baseline_m, cure)
         T_right_cam = torch.eye(4).to(K_left).repeat(len(K_left), 1, 1)
         T_right_cam[:, 0, 3] = -torch.as_tensor(baseline_m, dtype=K_left.dtype, device=K_left.device)
         of_right = of_right.expand_as(K_left).clone()
@@ -105,12 +108,15 @@ class StereoCamera(TensorRecord):
     @classmethod
     def from_projections(
         cls,
-        P_left: Tensor,  # (F, 3, 4)
-        P_right: Tensor,  # (F, 3, 4)
+        P_left: Tensor,  # (3, 4) or (F, 3, 4)
+        P_right: Tensor,  # of the same shape
         disparity_field: DisparityField | None = None,
     ) -> StereoCamera:
-        """The pair of KITTI's P2 and P3: `K = P[:, :3]`, `t_left = K^-1 P2[:, 3]`,
-        `T_right_cam = [I, t_right - t_left]`.
+        """The rectified pair of two projections: P2 and P3 of KITTI, P of both `camera_info` of ROS, P1 and P2 of
+        OpenCV's `stereoRectify`.
+
+        `K = P[:, :3]`, `t_left = K^-1 P_left[:, 3]`, `T_right_cam = [I, t_right - t_left]`: the baseline of an ideal
+        pair is `-P_right[0, 3] / P_right[0, 0]`. The matrix K of a `camera_info` is that of the raw images.
 
         Raises:
             InputError: wrong shapes or types, a K that has no inverse, or a right camera that is not to the right of
@@ -119,20 +125,28 @@ class StereoCamera(TensorRecord):
         Examples:
             >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
             >>> shift = torch.tensor([[-378.0], [0.0], [0.0]])
-            >>> P_left = torch.cat([K, torch.zeros(3, 1)], dim=1)[None]
-            >>> P_right = torch.cat([K, shift], dim=1)[None]
+            >>> P_left = torch.cat([K, torch.zeros(3, 1)], dim=1)
+            >>> P_right = torch.cat([K, shift], dim=1)
             >>> StereoCamera.from_projections(P_left, P_right).baseline
             tensor([0.5400])
         """
-        check_shape("P_left", P_left, ("F", 3, 4))
-        check_shape("P_right", P_right, (len(P_left), 3, 4))
+        cure = "give the projections P, whose fourth column holds the baseline; with K alone there is from_intrinsics"
+        is_one = isinstance(P_left, Tensor) and P_left.ndim == 2
+        check_shape("P_left", P_left, (3, 4) if is_one else ("F", 3, 4), cure)
+        check_shape("P_right", P_right, P_left.shape, cure)
         if P_left.dtype not in (torch.float32, torch.float64):
             raise InputError("P_left", "float32 or float64", str(P_left.dtype), "convert it with .float() or .double()")
         check_alike("P_right", P_right, "P_left", P_left)
+        if is_one:
+            P_left, P_right = P_left[None], P_right[None]
         K_left, K_right = P_left[..., :3], P_right[..., :3]
         t_left, t_right = _translation("P_left", P_left), _translation("P_right", P_right)
         T_right_cam = torch.eye(4, dtype=P_left.dtype, device=P_left.device).repeat(len(P_left), 1, 1)
         T_right_cam[:, :3, 3] = t_right - t_left
+        not_right = ~(t_right[:, 0] < t_left[:, 0]) & P_right.isfinite().flatten(1).all(dim=1)
+        expected = "fourth columns with P_right[0, 3] = -fx baseline + P_left[0, 3], the baseline above 0"
+        cure = "swap P_left and P_right, or take the right camera's own P (in its camera_info P[0, 3] is below 0)"
+        check_rows("P_right", not_right, P_right, expected, cure)
         return cls(K_left.clone(), K_right.clone(), T_right_cam, t_left, disparity_field)
 
     @classmethod
@@ -205,11 +219,14 @@ class StereoCamera(TensorRecord):
 def _intrinsics(name: str, K: Tensor) -> Tensor:
     """Intrinsics (F, 3, 3) of one frame or of F, checked."""
     shape = (3, 3) if isinstance(K, Tensor) and K.ndim == 2 else ("F", 3, 3)
-    check_shape(name, K, shape, kind="floating")
+    is_projection = isinstance(K, Tensor) and K.shape[-2:] == (3, 4)
+    cure = "for projections P there is from_projections(P_left, P_right)" if is_projection else ""
+    check_shape(name, K, shape, cure, kind="floating")
     K = K if K.ndim == 3 else K[None]
     last_row = K.new_tensor([0.0, 0.0, 1.0])
     if not bool(((K[:, 2] == last_row).all(1) & (K[:, 1, 0] == 0) & (K[:, 0, 0] > 0) & (K[:, 1, 1] > 0)).all()):
-        raise InputError(name, "[[fx, s, cx], [0, fy, cy], [0, 0, 1]], pixels", f"{K.tolist()}", "mind its transpose")
+        cure = "give K of the rectified images as rows, in pixels; this may be its transpose or its inverse"
+        raise InputError(name, "[[fx, s, cx], [0, fy, cy], [0, 0, 1]], pixels", f"{K.tolist()}", cure)
     return K
 
 

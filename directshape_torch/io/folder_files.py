@@ -94,7 +94,7 @@ def read_rig(path: Path) -> FolderRig:
     """Read `rig.json`."""
     rig = record_of(path, FolderRig, _read(path), _CURE)
     if (rig.baseline_m is None) == (rig.t_right_cam_m is None):
-        raise DataFormatError(path, "must hold either 'baseline_m' or 't_right_cam_m'", cure=_CURE)
+        raise DataFormatError(path, "must hold either 'baseline_m' or 't_right_cam_m', not both or none", cure=_CURE)
     for name, K in (("K_left", rig.K_left), ("K_right", rig.K_right or rig.K_left)):
         if list(K[2]) != [0, 0, 1] or min(K[0][0], K[1][1]) <= 0:
             raise DataFormatError(path, f"{name!r} is no matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", cure=_CURE)
@@ -141,7 +141,7 @@ def calibration_of(path: Path) -> KittiCalibration:
     """The projections of `rig.json`."""
     rig = read_rig(path)
     width, height = rig.image_size_wh
-    return KittiCalibration(path, *rig.projections(), size_wh=(width, height))
+    return KittiCalibration(path, *rig.projections(), size_wh=(width, height), names=("K_left", "K_right"))
 
 
 def detections_of(path: Path, rig_path: Path) -> list[KittiObject]:

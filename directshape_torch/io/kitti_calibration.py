@@ -45,6 +45,7 @@ class KittiCalibration:
     R0_rect: NDArray[np.float64] | None = None  # camera 0 to rectified camera 0, (3, 3), or None
     Tr_velo_to_cam: NDArray[np.float64] | None = None  # LiDAR to camera 0, (3, 4), metres, or None
     size_wh: tuple[int, int] | None = None  # of the images, where the file says
+    names: tuple[str, str] = ("P2", "P3")  # of what the file says of the left and of the right camera
 
     def of_size(self, size_wh: tuple[int, int]) -> Self:
         """The calibration itself; raises `DataFormatError` where the file says that images are of another size."""
@@ -61,47 +62,68 @@ def read_calibration(path: Path | str) -> KittiCalibration:
     It is `calib/NNNNNN.txt` of the object benchmark, `calib.txt` of a tracking or an odometry sequence, or
     `calib_cam_to_cam.txt` of a raw drive.
     """
-    cure = "a stereo pair needs the projections P2 and P3"
-    matrices = _read_matrices(path, _CAMERAS, ("P2", "P3"), cure)
-    velo_to_rect = matrices.pop("Tr_velo_to_rect", None)
+    cure = "a stereo pair needs the projections P2 and P3 (of raw drives P_rect_02 and P_rect_03)"
+    found, called = _read_matrices(path, _CAMERAS, ("P2", "P3"), cure)
+    velo_to_rect = found.pop("Tr_velo_to_rect", None)
     if velo_to_rect is not None:
         # The odometry benchmark has its rotation to rectified images in it.
-        matrices = {"R0_rect": np.eye(3), "Tr_velo_to_cam": velo_to_rect} | matrices
-    return KittiCalibration(Path(path), **matrices)
+        found = {"R0_rect": np.eye(3), "Tr_velo_to_cam": velo_to_rect} | found
+    return KittiCalibration(Path(path), **found, names=(called["P2"], called["P3"]))
 
 
 def read_velo_to_cam(path: Path | str) -> NDArray[np.float64]:
     """LiDAR to camera 0, (3, 4), metres, from `calib_velo_to_cam.txt` of the raw recordings (lines `R:` and `T:`)."""
     cure = "a scan needs rotation and translation of its LiDAR"
-    found = _read_matrices(path, _LIDAR, ("R", "T"), cure)
+    found, _ = _read_matrices(path, _LIDAR, ("R", "T"), cure)
     return np.concatenate([found["R"], found["T"]], axis=1)
 
 
 def _read_matrices(
     path: Path | str, known: Mapping[str, tuple[str, tuple[int, int]]], needed: Sequence[str], cure: str
-) -> dict[str, Any]:
-    """The matrices in lines of `name: numbers`, the colon being optional; further lines are passed over."""
-    matrices: dict[str, Any] = {}
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """The matrices in lines of `name: numbers`, the colon being optional, and what each is called in the file.
+
+    Further lines are passed over.
+    """
+    matrices, called = dict[str, Any](), dict[str, str]()
     for line in read_lines(path):
         words = line.text.split()
         name, shape = known.get(words[0].rstrip(":"), (None, (0, 0)))
         if name is not None:
+            called[name] = words[0].rstrip(":")
             matrices[name] = finite_numbers(path, line, shape[0] * shape[1], words[1:]).reshape(shape)
     for name in needed:
         if name not in matrices:
             raise DataFormatError(path, f"has no line {name}:", cure=cure)
-    return matrices
+    return matrices, called
 
 
 def to_stereo_camera(calibration: KittiCalibration) -> StereoCamera:
     """The camera of one frame, float64: `K = P2[:, :3]`, `x_cam = x_ref + K^-1 P2[:, 3]`, the right one from P3."""
     P2, P3 = (torch.from_numpy(matrix)[None] for matrix in (calibration.P2, calibration.P3))
     if not min(P2[0, 0, 0], P3[0, 0, 0]) > 0:
-        raise DataFormatError(calibration.path, "P2 and P3 need focal lengths above 0")
+        problem = f"{' and '.join(calibration.names)} need focal lengths above 0"
+        raise DataFormatError(calibration.path, problem, cure="check the order of the numbers")
     try:
         return StereoCamera.from_projections(P2, P3)
     except InputError as error:
-        raise DataFormatError(calibration.path, f"P2 and P3 describe no stereo rig: {error}") from error
+        raise DataFormatError(calibration.path, _no_rig(calibration, error), cure=_cure_of_rig(calibration)) from error
+
+
+def _no_rig(calibration: KittiCalibration, error: InputError) -> str:
+    """What is wrong with a rig, in the words of its file."""
+    left, right = calibration.names
+    if error.name != "P_right":
+        return f"{left} and {right} describe no stereo rig: {error}"
+    baseline = calibration.P2[0, 3] / calibration.P2[0, 0] - calibration.P3[0, 3] / calibration.P3[0, 0]
+    return f"describes a right camera that is not to the right of the left one (baseline {baseline:.4f} m)"
+
+
+def _cure_of_rig(calibration: KittiCalibration) -> str:
+    left, right = calibration.names
+    if left == "K_left":
+        return "give baseline_m above 0, or t_right_cam_m with a first component below 0 (docs/plain_folder.md)"
+    return f"{right}[0, 3] / fx must be below {left}[0, 3] / fx: were the two exchanged, or is a sign wrong?"
 
 
 def camera_of_rig(

@@ -53,7 +53,8 @@ def test_bad_lines(tmp_path: Path, old: str, new: str, message: str) -> None:
 def test_flipped_baseline_names_the_file(tmp_path: Path) -> None:
     text = f"P2: {P3}\nP3: {P2}\n"
     with pytest.raises(
-        DataFormatError, match=r"000000\.txt: P2 and P3 describe no stereo rig: .*baseline -0\.53\d\d m"
+        DataFormatError,
+        match=r"000000\.txt: .* not to the right of .*baseline -0\.53\d\d m.*P3\[0, 3\] / fx must be below P2\[0, 3\]",
     ):
         to_stereo_camera(read_calibration(write(tmp_path, text)))
 
