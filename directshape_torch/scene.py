@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses
+from directshape_torch.geometry.box_formats import BoxFormat, box_form, boxes_to_poses, check_upright
 from directshape_torch.geometry.ground_plane import GroundPlane
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.masks import MaskCrops, Masks
@@ -191,6 +191,7 @@ class Detections(TensorRecord):
             collated with frames that have some, 0 stands for none.
         track_id: (B,) int64 or int32: detections of one number are views of one car in several frames, which get one
             shape (docs/tracks.md); below 0: a car by itself. None: all of them are.
+        convention: how the boxes were written before they became poses and dimensions; messages use its words.
 
     Raises:
         InputError: wrong shapes or types, a rotation that is none, dimensions or standard deviations that are not
@@ -212,18 +213,21 @@ class Detections(TensorRecord):
     pose_sigma: Annotated[Tensor | None, Dense("B", 4)] = None
     offset_sigma_px: Annotated[Tensor | None, Dense("B")] = None
     track_id: Annotated[Tensor | None, Dense("B", kind="index")] = None
+    convention: BoxFormat = "kitti"
 
     def __post_init__(self) -> None:
         _cut_masks(self)
         super().__post_init__()
         _check_mask_numbers(self.mask_left, self.mask_right, len(self.frame_index))
+        form = box_form(self.convention)
         check_type("occluders", self.occluders, (Occluders, NoneType))
         has_pose = self.T_cam_obj.isfinite().flatten(1).all(dim=1)
         T_known = torch.where(has_pose[:, None, None], self.T_cam_obj, torch.eye(4).to(self.T_cam_obj))
         # One wait for the device for both. Dimensions that are NaN pass: they fail their own car.
         if bool((is_no_rotation(T_known) | (self.dimensions_hwl <= 0).any(dim=1).to(T_known.device)).any()):
             check_rotation("T_cam_obj", T_known)
-            expected, cure = "height, width and length above 0, metres", "leave out objects without a 3D box"
+            expected = "height, width and length above 0, metres"
+            cure = f"leave out objects without a 3D box; sizes of {self.convention!r} boxes are {form.order}"
             unfit = (self.dimensions_hwl <= 0).any(dim=1)
             check_rows("dimensions_hwl", unfit, self.dimensions_hwl, expected, cure)
         if self.pose_sigma is not None:
@@ -261,7 +265,7 @@ class Detections(TensorRecord):
         Args:
             boxes: x, y, z, three sizes and heading, or corners, in metres and radians; what they mean, and in which
                 order, says the convention (`directshape_torch.geometry.box_formats`).
-            convention: "kitti", "mmdet3d_camera", "mmdet3d_lidar", "nuscenes" or "opencv".
+            convention: "kitti", "mmdet3d_camera", "mmdet3d_lidar", "openpcdet", "nuscenes" or "opencv".
             mask_left, mask_right: (B, H, W) bool, uint8 (0 and 1, or 0..255) or foreground probability; or B entries
                 that are (H, W) or None; tensors or numpy arrays. Right masks may be left out, left ones not: a car
                 without a left mask is not refined.
@@ -276,8 +280,8 @@ class Detections(TensorRecord):
             occluders, pose_sigma, track_id: as in the class.
 
         Raises:
-            InputError: no masks at all, LiDAR boxes without `T_cam_boxes`, corners that make no box, and what the class
-                raises.
+            InputError: no masks at all, LiDAR boxes without `T_cam_boxes`, one that does not take up to up (such as
+                the inverse), corners that make no box, and what the class raises.
 
         Examples:
             >>> boxes = torch.tensor([[1.0, 0.85, 20.0, 4.0, 1.6, 1.5, 0.3]])
@@ -288,6 +292,8 @@ class Detections(TensorRecord):
             (tensor([ 1.0000,  1.6000, 20.0000]), tensor([[100.,  50., 179.,  79.]]))
         """
         T_cam_obj, dimensions_hwl = boxes_to_poses(boxes, convention, T_cam_boxes)
+        if T_cam_boxes is not None:
+            check_upright(T_cam_boxes, convention)
         count = len(boxes)
         if mask_left is None:
             cure = "give mask_left; a car without a left mask is not refined"
@@ -312,6 +318,7 @@ class Detections(TensorRecord):
             occluders=occluders,
             pose_sigma=pose_sigma,
             track_id=track_id,
+            convention=convention,
         )
 
     @property

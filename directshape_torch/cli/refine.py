@@ -35,6 +35,7 @@ from directshape_torch.rig.estimate import RigEstimate, RigEstimates
 from directshape_torch.rig.from_files import estimate_rigs
 from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, known_rigs, load_rigs, save_rigs
 from directshape_torch.scene_check.check_scene import check_scene
+from directshape_torch.scene_check.words import words_of_files
 from directshape_torch.terms.lidar import LidarPoints
 from directshape_torch.visualize.rig_picture import draw_rigs
 
@@ -136,7 +137,8 @@ def _warned_of(dataset: StereoDataset, config: RefinerConfig) -> RefinerConfig:
         frames, detections = collate([dataset.load(frame_id) for frame_id in dataset.frame_ids[:_CHECKED_FRAMES]])
     except (DirectShapeError, OSError):  # the run says which frame cannot be read, and goes on with the others
         return config
-    for finding in check_scene(frames, detections, match_images=False).findings:
+    words = words_of_files(dataset.layout.files(dataset.frame_ids[0]).calibration)
+    for finding in check_scene(frames, detections, match_images=False, words=words).findings:
         print(f"check: {finding} ('directshape check-data' looks closer)", file=sys.stderr)
     return replace(config, check="off")
 

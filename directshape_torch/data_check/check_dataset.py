@@ -16,6 +16,7 @@ from directshape_torch.rig.rig import Rig
 from directshape_torch.scene_check.car_evidence import FrameEvidence
 from directshape_torch.scene_check.check_scene import check_cars
 from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, found
+from directshape_torch.scene_check.words import words_of_files
 
 DEFAULT_MAX_FRAMES = 20
 REPORT_SCHEMA_VERSION = 1
@@ -53,7 +54,12 @@ def check_dataset(
         evidence += [] if of_its_cars is None else [of_its_cars]
         num_cars += count
         tell(frame_id)
-    nothing = found("no_cars", "all frames", "no detection of the chosen classes with a 3D box")
+    nothing = found(
+        "no_cars",
+        "all frames",
+        "no detection of the chosen classes with a 3D box",
+        words=words_of_files(dataset.layout.files(dataset.frame_ids[0]).calibration),
+    )
     of_cars = check_cars(evidence) if num_cars else [nothing]
     # Of boxes or images that are wrong an estimate would only say the same again.
     if not any(finding.severity == "error" for finding in (*findings, *of_cars)):

@@ -25,9 +25,9 @@ from directshape_torch.scene import SIDES
 from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence, Pair
 from directshape_torch.scene_check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, check_images
 from directshape_torch.scene_check.finding import Finding, names, unreadable
+from directshape_torch.scene_check.words import Words, words_of_files
 
 _Part = TypeVar("_Part")
-_CALIBRATION = "P2 and P3, 12 finite numbers each, or rig.json as in docs/plain_folder.md"
 
 
 class _Attempts:
@@ -54,22 +54,23 @@ def check_frame(dataset: StereoDataset, frame_id: str) -> tuple[list[Finding], i
     """All findings about a frame, the number of its cars, and what it shows of them, None where its images or its
     calibration are wrong."""
     files, attempt = dataset.layout.files(frame_id), _Attempts(f"frame {frame_id}")
-    pair, calibration = _read_pair(files, attempt), attempt("calibration_file", _CALIBRATION, files.read_calibration)
+    words = words_of_files(files.calibration)
+    pair = _read_pair(files, attempt)
+    calibration = attempt("calibration_file", words.calibration_file, files.read_calibration)
+    words = words if calibration is None else words_of_files(files.calibration, calibration.names)
     size_hw = None if pair is None else (pair[0].shape[0], pair[0].shape[1])
     if size_hw is not None and calibration is not None:
         same_size = partial(calibration.of_size, size_hw[::-1])
         if attempt("image_size", "the size that the calibration is of", same_size) is None:
             pair = size_hw = None  # what rests on both would only say the same again
-    objects = attempt(
-        "detection_file", "lines of 15 or 16 columns, or JSON as in docs/plain_folder.md", files.read_objects
-    )
+    objects = attempt("detection_file", words.detection_file, files.read_objects)
     masks = None
     if size_hw is not None and dataset.masks is not None:
         masks = attempt("mask_file", "masks of both images", partial(dataset.masks.read, frame_id, size_hw))
     attempt("plane_file", "a x + b y + c z + d = 0 with |b| near 1", files.read_plane)
     findings, camera = attempt.findings, None
     if calibration is not None:
-        findings += check_calibration(*numbers_of(calibration), size_hw, attempt.where)
+        findings += check_calibration(*numbers_of(calibration), size_hw, attempt.where, words)
         # One that is no stereo pair's has been found by that. A singular matrix is a RuntimeError.
         with suppress(DirectShapeError, RuntimeError):
             camera = to_stereo_camera(calibration)
@@ -80,7 +81,7 @@ def check_frame(dataset: StereoDataset, frame_id: str) -> tuple[list[Finding], i
     cars = [o for o in objects or [] if o.type in dataset.classes and o.has_box_3d]
     if camera is None or size_hw is None:
         return findings, len(cars), None
-    evidence = _evidence(frame_id, cars, masks, camera, size_hw)
+    evidence = _evidence(frame_id, cars, masks, camera, size_hw, words)
     return findings, len(cars), replace(evidence, pair=None if names(findings) & SPOILS_PAIR else pair)
 
 
@@ -96,7 +97,7 @@ def numbers_of(calibration: KittiCalibration) -> tuple[dict[str, NDArray[np.floa
     """Intrinsics by camera, and the baseline in metres, NaN where a focal length is 0."""
     P = {
         f"{name} of {calibration.path.name}": matrix
-        for name, matrix in (("P2", calibration.P2), ("P3", calibration.P3))
+        for name, matrix in zip(calibration.names, (calibration.P2, calibration.P3), strict=True)
     }
     shift = [matrix[0, 3] / (matrix[0, 0] or np.nan) for matrix in P.values()]
     return {name: matrix[:, :3] for name, matrix in P.items()}, float(shift[0] - shift[1])
@@ -108,6 +109,7 @@ def _evidence(
     masks: list[InstanceMask] | None,
     camera: StereoCamera,
     size_hw: tuple[int, int],
+    words: Words,
 ) -> FrameEvidence:
     """Masks are matched by 2D boxes alone, for the 3D ones are what is in question. Those of the right image are held
     against the same boxes, where they should fit less well."""
@@ -140,6 +142,7 @@ def _evidence(
         camera=camera,
         size_hw=size_hw,
         has_masks=masks is not None,
+        words=words,
     )
 
 

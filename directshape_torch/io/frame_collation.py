@@ -96,7 +96,7 @@ def _alike(frames: Sequence[FrameBatch], size_hw: Size) -> list[FrameBatch]:
 
 def _filled(d: Detections, known: set[str], size_hw: Size) -> Detections:
     """Padded, with occluders, and with what other frames have for what is not known."""
-    nothing = {
+    nothing: dict[str, Any] = {
         "pose_sigma": d.T_cam_obj.new_full((len(d), 4), torch.inf),
         "offset_sigma_px": torch.zeros_like(d.T_cam_obj[:, 0, 0]),
         "track_id": torch.full_like(d.frame_index, -1),

@@ -13,6 +13,7 @@ from directshape_torch.geometry.box3d import rotation_y_from_pose
 from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.scene import SIDES, Detections, FrameBatch, Side
+from directshape_torch.scene_check.words import Words, words_of_tensors
 from directshape_torch.stereo_matching.disparity import rgb8
 
 Floats = NDArray[np.float64]
@@ -49,17 +50,22 @@ class FrameEvidence:
     camera: StereoCamera  # of the frame
     size_hw: tuple[int, int]  # of its images
     has_masks: bool  # whether the frame's masks could be read
+    words: Words  # of its source
     pair: Pair | None = None  # its images, where distances can be measured by them
 
 
-def evidence_of_scene(frames: FrameBatch, detections: Detections) -> list[FrameEvidence]:
-    """The evidence of every frame; cars with numbers that are not finite, or without 2D box and mask, are left out."""
+def evidence_of_scene(frames: FrameBatch, detections: Detections, words: Words | None = None) -> list[FrameEvidence]:
+    """The evidence of every frame; cars with numbers that are not finite, or without 2D box and mask, are left out.
+
+    Its words are those of the tensors, unless others are given.
+    """
+    words = words or words_of_tensors(detections.convention)
     usable = (_array(detections.T_cam_obj).reshape(-1, 16), _array(detections.dimensions_hwl))
     known = np.logical_and.reduce([np.isfinite(part).all(axis=1) for part in usable])
     known &= np.isfinite(_array(detections.box_2d)).all(axis=1) | detections.has_mask_left.cpu().numpy()
     sizes = frames.sizes.cpu().tolist()
     return [
-        _frame_evidence(frames, detections, number, _known_rows(detections, number, known), (height, width))
+        _frame_evidence(frames, detections, number, _known_rows(detections, number, known), (height, width), words)
         for number, (height, width) in enumerate(sizes)
     ]
 
@@ -69,7 +75,7 @@ def _known_rows(detections: Detections, number: int, known: NDArray[np.bool_]) -
 
 
 def _frame_evidence(
-    frames: FrameBatch, d: Detections, number: int, rows: NDArray[np.int64], size_hw: tuple[int, int]
+    frames: FrameBatch, d: Detections, number: int, rows: NDArray[np.int64], size_hw: tuple[int, int], words: Words
 ) -> FrameEvidence:
     chosen = torch.from_numpy(rows).to(d.T_cam_obj.device)
     masks = {side: (d.mask_left if side == "left" else d.mask_right).rows(chosen).detach() for side in SIDES}
@@ -98,6 +104,7 @@ def _frame_evidence(
         camera=_camera_of(frames.camera, number),
         size_hw=size_hw,
         has_masks=True,
+        words=words,
         pair=_pair(frames, number, size_hw),
     )
 

@@ -1,4 +1,4 @@
-"""Whether boxes are written as KITTI writes them: axes, origin, heading, order of lengths, units; corners in 2D."""
+"""Whether boxes are written as their convention says: axes, origin, heading, order of lengths, units; corners in 2D."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from directshape_torch.scene_check.conventions import (
     ConventionScores,
     projected_boxes,
     score_conventions,
+    spoken,
 )
 from directshape_torch.scene_check.finding import Finding, found, of_cars
+from directshape_torch.scene_check.words import Words
 
 # Mean overlap that another convention must gain for boxes to be taken as written in it: with the observation angles,
 # and without them for many and for few cars. Intact sets gain nothing, single frames of two to six cars up to 0.05.
@@ -35,10 +37,11 @@ _FACTORS = {
         "focal_length",
         "focal lengths",
         "focal lengths of the images as they are",
-        "check K: is it of these images, or of others in size or crop?",
+        "check K: is it of these rectified images, or of others in size or crop, or of the raw ones (in a camera_info "
+        "K is of the raw images, P[:, :3] of the rectified ones)?",
     ),
-    "distance": ("box_units", "locations", "metres", "write locations in metres"),
-    "size": ("box_units", "lengths", "full lengths in metres", "write full lengths, not halves, in metres"),
+    "distance": ("box_units", "locations", "metres", "give locations in metres"),
+    "size": ("box_units", "lengths", "full lengths in metres", "give full lengths, not halves, in metres"),
 }
 
 
@@ -47,7 +50,7 @@ def check_boxes(frames: Sequence[FrameEvidence]) -> list[Finding]:
     frames = [frame for frame in frames if len(frame.boxes)]
     if not frames:
         return []
-    of_numbers = _check_lengths(frames) + _check_turns(frames)
+    of_numbers, words = _check_lengths(frames) + _check_turns(frames), frames[0].words
     scores = score_conventions(frames)
     best = _better_convention(scores)
     overlap = float(scores.overlap[0 if best is None else best].mean())
@@ -57,9 +60,9 @@ def check_boxes(frames: Sequence[FrameEvidence]) -> list[Finding]:
             return of_masks
     if best is not None:
         of_numbers = [finding for finding in of_numbers if finding.check == "box_units"]
-        return of_numbers + _deviations(scores, best)
+        return of_numbers + _deviations(scores, best, words)
     if overlap < MIN_OVERLAP and not of_numbers:
-        return [_unexplained(overlap, scores)]
+        return [_unexplained(overlap, scores, words)]
     return of_numbers
 
 
@@ -77,12 +80,12 @@ def _better_convention(scores: ConventionScores) -> int | None:
     return None
 
 
-def _deviations(scores: ConventionScores, best: int) -> list[Finding]:
+def _deviations(scores: ConventionScores, best: int, words: Words) -> list[Finding]:
     before, after = scores.overlap[0].mean(), scores.overlap[best].mean()
     findings = []
     for part, value in scores.conventions[best].deviations.items():
         check, what, expected, cure = _FACTORS.get(part, (f"box_{part}", "", "", ""))
-        way = f"their {what} are multiplied by {value:.4g}" if what else f"read as '{value}'"
+        way = f"their {what} are multiplied by {value:.4g}" if what else f"read as '{spoken(part, value, words.form)}'"
         measured = (
             f"they fit when {way}: projected boxes overlap 2D boxes or masks by {after:.2f} instead of {before:.2f}"
         )
@@ -90,29 +93,45 @@ def _deviations(scores: ConventionScores, best: int) -> list[Finding]:
         if share is not None and share[best] > share[0]:
             measured += f", alpha agrees in {share[best]:.0%} instead of {share[0]:.0%}"
         where = of_cars(scores.overlap.shape[1])
-        findings.append(found(check, where, measured, expected=expected, cure=cure))
+        findings.append(found(check, where, measured, words=words, expected=expected, cure=cure))
     return findings
 
 
-def _unexplained(overlap: float, scores: ConventionScores) -> Finding:
+def _unexplained(overlap: float, scores: ConventionScores, words: Words) -> Finding:
     measured = (
         f"projected boxes overlap 2D boxes and masks by {overlap:.2f} in the mean, and no known convention does better"
     )
-    return found("box_projection", of_cars(scores.overlap.shape[1]), measured, limit=MIN_OVERLAP)
+    return found("box_projection", of_cars(scores.overlap.shape[1]), measured, words=words, limit=MIN_OVERLAP)
 
 
 def _check_lengths(frames: Sequence[FrameEvidence]) -> list[Finding]:
     hwl = np.concatenate([frame.boxes.hwl for frame in frames])
     height, width, _ = np.median(hwl, axis=0)
     longest = float(np.median(hwl.max(axis=1)))
-    where, (low, high) = of_cars(len(hwl)), LENGTHS_M
+    where, (low, high), words = of_cars(len(hwl)), LENGTHS_M, frames[0].words
     if not low < longest < high:
         return [
-            found("box_units", where, f"the longest side of a box is {longest:.3g} in the median", low=low, high=high)
+            found(
+                "box_units",
+                where,
+                f"the longest side of a box is {longest:.3g} in the median",
+                words=words,
+                low=low,
+                high=high,
+            )
         ]
     if len(hwl) >= MIN_CARS_FOR_SHAPE and height > MAX_HEIGHT_TO_WIDTH * width:
         measured = f"boxes are {height:.2f} m high and {width:.2f} m wide in the median"
-        return [found("box_order", where, measured, severity="warning", expected="cars that are wider than high")]
+        return [
+            found(
+                "box_order",
+                where,
+                measured,
+                words=words,
+                severity="warning",
+                expected=f"cars that are wider than high; sizes are {words.form.order}",
+            )
+        ]
     return []
 
 
@@ -120,7 +139,9 @@ def _check_turns(frames: Sequence[FrameEvidence]) -> list[Finding]:
     yaw = np.concatenate([frame.boxes.rotation_y for frame in frames])
     if np.abs(yaw).max() <= _ONE_TURN:
         return []
-    return [found("box_yaw", of_cars(len(yaw)), f"rotation_y reaches {np.abs(yaw).max():.1f}")]
+    words = frames[0].words
+    measured = f"{words.form.heading.split()[0]} reaches {np.abs(yaw).max():.1f}"
+    return [found("box_yaw", of_cars(len(yaw)), measured, words=words)]
 
 
 def check_box_2d(frames: Sequence[FrameEvidence]) -> list[Finding]:

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.scene_check.check_places import swapped
 from directshape_torch.scene_check.finding import Finding, Severity, found
+from directshape_torch.scene_check.words import Words
 
 # With these wrong, what disparities and projections show says nothing more.
-SPOILS_CAMERA = frozenset({"baseline_sign", "baseline_length", "focal_length", "principal_point"})
+SPOILS_CAMERA = frozenset({"raw_intrinsics", "baseline_sign", "baseline_length", "focal_length", "principal_point"})
 SPOILS_PAIR = frozenset(
     {"images_swapped", "image_mirrored", "same_image", "different_scenes", "not_rectified", "few_matches"}
 )
@@ -24,6 +25,8 @@ CENTRE_SHARE_WARNING = 0.15
 BASELINES_M = (0.03, 3.0)
 # The squares of pixels: rectified images have them unless resized in one direction.
 ASPECT_TOLERANCE = 0.05
+# By how much focal lengths (a share) and rows of the centre (pixels) of a rectified pair differ at most: by rounding.
+_FOCAL_TOLERANCE, _ROW_TOLERANCE_PX = 0.002, 0.5
 # Images that were resized move both coordinates of the centre by the same factor, which is none near 1.
 _SAME_FACTOR, _LEAST_FACTOR = 0.1, 1.3
 MIN_MATCHES = 30
@@ -50,18 +53,21 @@ def check_calibration(
     baseline_m: float,
     size_hw: tuple[int, int] | None,
     where: str,
+    words: Words,
 ) -> list[Finding]:
     """Everything that the numbers alone show: intrinsics (3, 3) by camera, baseline (NaN: a focal length is nothing)
     and size of the images, where it is known."""
     findings = []
     if size_hw is not None:
         findings = [f for name, K in cameras.items() for f in _check_intrinsics(K, size_hw, f"{where}, {name}")]
+    findings = findings or _check_alike(cameras, where)
     if baseline_m <= 0:
         measured = f"baseline {baseline_m:.4f} m: the right camera is not to the right of the left one"
-        return [*findings, found("baseline_sign", where, measured)]
+        return [*findings, found("baseline_sign", where, measured, words=words)]
     low, high = BASELINES_M
     if baseline_m < low or baseline_m > high:  # neither of NaN
-        findings.append(found("baseline_length", where, f"baseline {baseline_m:.4g} m", low=low, high=high))
+        measured = f"baseline {baseline_m:.4g} m"
+        findings.append(found("baseline_length", where, measured, words=words, low=low, high=high))
     return findings
 
 
@@ -79,6 +85,18 @@ def _check_intrinsics(K: NDArray[np.float64], size_hw: tuple[int, int], where: s
     if abs(fx / fy - 1) > ASPECT_TOLERANCE:
         findings.append(found("focal_length", where, f"fx = {fx:.1f}, fy = {fy:.1f} px"))
     return findings + _check_centre((cx, cy), (width, height), where)
+
+
+def _check_alike(cameras: Mapping[str, NDArray[np.float64]], where: str) -> list[Finding]:
+    """Whether both images can have been rectified to these intrinsics; a warning, for images may be cut differently."""
+    left, right = cameras.values()
+    scale = max(abs(right[k, k] / left[k, k] - 1) for k in (0, 1))
+    if not (scale > _FOCAL_TOLERANCE or abs(right[1, 2] - left[1, 2]) > _ROW_TOLERANCE_PX):
+        return []
+    fx, fy, cy = (f"{left[at]:.1f} and {right[at]:.1f}" for at in ((0, 0), (1, 1), (1, 2)))
+    measured = f"left and right differ: fx = {fx}, fy = {fy}, cy = {cy} px"
+    severity: Severity = "error" if scale > ASPECT_TOLERANCE else "warning"
+    return [found("raw_intrinsics", where, measured, severity=severity)]
 
 
 def _check_centre(centre: tuple[float, float], size_wh: tuple[int, int], where: str) -> list[Finding]:
@@ -117,26 +135,48 @@ def check_pair(
     if len(matches) < MIN_MATCHES or len(matches) < MIN_INLIER_SHARE * matches.num_candidates:
         measured = f"{len(matches)} of {matches.num_candidates} feature matches obey a common geometry"
         return [found("different_scenes", where, measured, share=MIN_INLIER_SHARE)]
-    # Freed of the difference of the principal points.
-    shift = 0.0 if camera is None else float(camera.K_left[0, 0, 2] - camera.K_right[0, 0, 2])
-    disparity = np.asarray(matches.uv_left[:, 0] - matches.uv_right[:, 0] - shift)
-    if float(np.median(np.hypot(disparity, matches.vertical))) < SAME_IMAGE_PX:
+    if float(np.median(np.hypot(*(matches.uv_left - matches.uv_right).T))) < SAME_IMAGE_PX:
         return [found("same_image", where, "matched points have the same place in both images")]
-    negative, rows = float(np.mean(disparity < -1.0)), _row_residual(matches, disparity, camera)
+    findings = _check_geometry(matches, camera, size_hw, where)
+    if camera is not None and findings and not _check_geometry(matches, None, size_hw, where):
+        return [_raw(matches, camera, where)]
+    return findings
+
+
+def _check_geometry(
+    matches: PairMatches, camera: StereoCamera | None, size_hw: tuple[int, int], where: str
+) -> list[Finding]:
+    """Whether points lie where a calibration lets them; without one in equal rows, and farther left on the right."""
+    disparity, rows = _residuals(matches, camera)
+    negative = float(np.mean(disparity < -1.0))
     sides = [swapped(where, disparity)] if negative > MAX_NEGATIVE_SHARE else []
     return sides + _check_rows(matches, rows, size_hw, where)
 
 
-def _row_residual(
-    matches: PairMatches, disparity: NDArray[np.float64], camera: StereoCamera | None
-) -> NDArray[np.float64]:
-    """(N,) `v_right - v_left` beyond what the calibration explains, pixels."""
+def _raw(matches: PairMatches, camera: StereoCamera, where: str) -> Finding:
+    """That matches speak against the calibration, and not against that of an ideal rectified pair."""
+    (disparity, rows), (_, equal) = _residuals(matches, camera), _residuals(matches, None)
+    measured = (
+        f"{len(matches)} matched points have the same rows in both images within {np.median(np.abs(equal)):.2f} px; by "
+        f"the calibration they are off by {np.median(np.abs(rows)):.2f} px, and {np.mean(disparity < -1.0):.0%} of the "
+        "points lie beyond infinity"
+    )
+    return found("raw_intrinsics", where, measured)
+
+
+def _residuals(matches: PairMatches, camera: StereoCamera | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Disparities (N,) as they were with equal intrinsics, and `v_right - v_left` (N,) beyond what the calibration
+    explains, pixels of the right image."""
     if camera is None:
-        return matches.vertical
+        return np.asarray(matches.uv_left[:, 0] - matches.uv_right[:, 0]), matches.vertical
     K_left, K_right, t = camera.K_left[0].numpy(), camera.K_right[0].numpy(), camera.T_right_cam[0, :3, 3].numpy()
+    scale = K_right.diagonal()[:2] / K_left.diagonal()[:2]
+    # Where the right camera would see what the left one sees, were it far away.
+    far = (matches.uv_left - K_left[:2, 2]) * scale + K_right[:2, 2]
+    disparity = far[:, 0] - matches.uv_right[:, 0]
     # t_y / z with z = fx b / disparity.
-    expected = K_right[1, 2] - K_left[1, 2] + disparity * (K_right[1, 1] / K_right[0, 0]) * (t[1] / -t[0])
-    return np.asarray(matches.vertical - expected)
+    lower = disparity * (K_right[1, 1] / K_right[0, 0]) * (t[1] / -t[0])
+    return np.asarray(disparity), np.asarray(matches.uv_right[:, 1] - far[:, 1] - lower)
 
 
 def _check_rows(

@@ -32,7 +32,7 @@ def check_masks(frames: Sequence[FrameEvidence]) -> list[Finding]:
         num_cars = sum(len(frame.boxes) for frame in frames)
         severity: Severity = "warning" if num_right else "error" if num_cars >= MIN_PAIRS else "note"
         measured = f"{num_left} masks of cars in the left images, {num_right} in the right ones"
-        return [found("no_masks", of_cars(num_cars), measured, severity=severity)]
+        return [found("no_masks", of_cars(num_cars), measured, words=frames[0].words, severity=severity)]
     left, right = (_mean_overlap(frames, side) for side in SIDES)
     if right > max(left + MIN_SWAP_GAIN, OVERLAP_WARNING) or _are_crossed(frames):
         measured = (

@@ -15,6 +15,7 @@ from directshape_torch.geometry.projection import depth_from_disparity
 from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence
 from directshape_torch.scene_check.conventions import projected_boxes
 from directshape_torch.scene_check.finding import Finding, Severity, found, of_cars
+from directshape_torch.scene_check.words import Words
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.zero_level import sdf_to_mesh
 
@@ -43,9 +44,10 @@ _LEAST_GAIN, _SURE = 0.035, 2.5
 # What the best of eight headings gains for each car by itself, where headings say nothing; 0.03 where they are right.
 _LEAST_FREE_GAIN, _FEWEST_FREE = 0.12, 8
 _HEADINGS = np.arange(8) * np.pi / 4
-_WAYS: dict[str, tuple[Callable[[float], float], str]] = {
-    "turned by 180 degrees": (lambda yaw: yaw + np.pi, "add pi to the headings"),
-    "with the opposite sign": (lambda yaw: -yaw, "negate the headings"),
+# Other headings in KITTI's sense, by that and the one of a car that drives to the right, and the cure.
+_WAYS: dict[str, tuple[Callable[[float, float], float], str]] = {
+    "turned by 180 degrees": (lambda yaw, _: yaw + np.pi, "add pi to the headings"),
+    "with the opposite sign": (lambda yaw, right: 2 * right - yaw, "negate the headings"),
 }
 
 
@@ -166,6 +168,9 @@ def _cure(scale: float, by_size: float) -> str:
 
 def check_heading(frames: Sequence[FrameEvidence]) -> list[Finding]:
     """Whether the outlines of cars fit better with other headings."""
+    if not frames:
+        return []
+    words = frames[0].words
     gains = np.array([gain for frame in frames for gain in _gains(frame)]).reshape(-1, len(_WAYS) + 2)
     ways = {}
     of_side = gains[gains[:, -1] > _MIN_SIDE_VIEW]
@@ -175,27 +180,25 @@ def check_heading(frames: Sequence[FrameEvidence]) -> list[Finding]:
         ways = {way: mean[k] for k, way in enumerate(_WAYS) if sure[k]}
     if ways:
         way = max(ways, key=lambda each: ways[each])
-        return [_finding(len(of_side), f"fit the masks better {way}, by {ways[way]:.2f}", _WAYS[way][1])]
+        return [_finding(len(of_side), f"fit the masks better {way}, by {ways[way]:.2f}", _WAYS[way][1], words)]
     free = float(gains[:, -2].mean()) if len(gains) >= _FEWEST_FREE else 0.0
     if free < _LEAST_FREE_GAIN:
         return []
     measured = (
         f"fit the masks better with other headings, by {free:.2f}, and no rule says which: degrees look like this"
     )
-    return [_finding(len(gains), measured, "turn degrees into radians (torch.deg2rad), or check the order of headings")]
+    return [_finding(len(gains), measured, "turn degrees into radians, or check the order of headings", words)]
 
 
-def _finding(num_cars: int, measured: str, cure: str) -> Finding:
-    expected = "rotation_y in radians, 0 where the car drives along +x, -pi/2 where it drives along +z"
-    where = of_cars(num_cars)
-    return found("box_yaw", where, f"outlines of cars {measured}", expected=expected, cure=cure)
+def _finding(num_cars: int, measured: str, cure: str, words: Words) -> Finding:
+    return found("box_yaw", of_cars(num_cars), f"outlines of cars {measured}", words=words, cure=cure)
 
 
 def _gains(frame: FrameEvidence) -> list[list[float]]:
     """For each car what each way gains in agreement, what the best heading gains, and how much of its side is seen."""
     projected = projected_boxes(frame)
     height, width = frame.size_hw
-    gains = []
+    gains, right = [], frame.words.form.heading_of_right
     for car, mask in enumerate(frame.masks):
         around = frame.mask_boxes["left"][car]
         x, _, z = frame.boxes.location[car]
@@ -208,7 +211,7 @@ def _gains(frame: FrameEvidence) -> list[list[float]]:
         seen = _resized(mask, around)
         aspect = (around[2] - around[0] + 1) / (around[3] - around[1] + 1)
         as_given = _agreement(frame, car, yaw, seen, aspect)
-        ways = [_agreement(frame, car, way(yaw), seen, aspect) - as_given for way, _ in _WAYS.values()]
+        ways = [_agreement(frame, car, way(yaw, right), seen, aspect) - as_given for way, _ in _WAYS.values()]
         best = max(_agreement(frame, car, yaw + turn, seen, aspect) for turn in _HEADINGS)
         gains.append([*ways, best - as_given, abs(np.cos(yaw - np.arctan2(x, z)))])
     return gains

@@ -16,9 +16,12 @@ from directshape_torch.scene_check.check_masks import check_masks
 from directshape_torch.scene_check.check_places import check_distances, check_heading, check_swapped, measure_cars
 from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, names
 from directshape_torch.scene_check.finding import found as found_mistake
+from directshape_torch.scene_check.words import Words
 
 
-def check_scene(frames: FrameBatch, detections: Detections, match_images: bool = True) -> CheckReport:
+def check_scene(
+    frames: FrameBatch, detections: Detections, match_images: bool = True, words: Words | None = None
+) -> CheckReport:
     """Look for what is commonly wrong with images, calibration, masks and boxes (docs/check_data.md).
 
     Among it: the centre of a box for its bottom, headings in degrees, off by 90 or 180 degrees or of the other sign,
@@ -31,6 +34,7 @@ def check_scene(frames: FrameBatch, detections: Detections, match_images: bool =
         detections: B cars; the more, the more is seen.
         match_images: match features of the two images too, which takes a second a frame; it shows whether they are
             rectified and of the same scene.
+        words: in which findings speak; default those of `detections.convention`.
 
     Returns:
         The findings; printed, it says what was measured, what was expected, and how to mend it.
@@ -56,7 +60,7 @@ def check_scene(frames: FrameBatch, detections: Detections, match_images: bool =
     check_type("frames", frames, (FrameBatch,))
     check_type("detections", detections, (Detections,))
     check_type("match_images", match_images, (bool,))
-    evidence = evidence_of_scene(frames.detach(), detections.detach())
+    evidence = evidence_of_scene(frames.detach(), detections.detach(), words)
     found = _once([finding for one in evidence for finding in _check_camera(one)])
     usable = not names(found) & SPOILS_CAMERA
     for one in evidence:
@@ -72,7 +76,7 @@ def check_scene(frames: FrameBatch, detections: Detections, match_images: bool =
 def _check_camera(one: FrameEvidence) -> list[Finding]:
     camera = one.camera
     matrices = {"left": camera.K_left[0].numpy(), "right": camera.K_right[0].numpy()}
-    return check_calibration(matrices, float(camera.baseline[0]), one.size_hw, f"frame {one.frame_id}")
+    return check_calibration(matrices, float(camera.baseline[0]), one.size_hw, f"frame {one.frame_id}", one.words)
 
 
 def check_cars(frames: Sequence[FrameEvidence]) -> list[Finding]:

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.geometry.box3d import pose_from_kitti
+from directshape_torch.geometry.box_formats import BoxForm
 from directshape_torch.geometry.image_boxes import box_iou, project_boxes
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence
@@ -31,25 +32,52 @@ def _axes(*signed: int) -> Callable[[Points], Points]:
 
 
 AS_DOCUMENTED = "as documented"
-AXES: dict[str, Callable[[Points], Points]] = {
-    AS_DOCUMENTED: _identity,
-    "x to the left (left-handed)": _axes(-1, 2, 3),
-    "y up": _axes(1, -2, 3),
-    "OpenGL's: y up, z backward": _axes(1, -2, -3),
-    "LiDAR's: x forward, y left, z up": _axes(-2, -3, 1),
-    "z up, y forward": _axes(1, -3, 2),
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Other axes of boxes that were read as documented: what brings locations (N, 3) and KITTI's headings (N,) of the
+    left camera's frame to what they should be there."""
+
+    points: Callable[[Points], Points] = _identity
+    yaw: Callable[[Angles], Angles] = _identity
+
+
+# Of boxes in a camera's frame; their headings count as documented.
+_CAMERA_AXES: dict[str, Axes] = {
+    AS_DOCUMENTED: Axes(),
+    "x to the left (left-handed)": Axes(_axes(-1, 2, 3)),
+    "y up": Axes(_axes(1, -2, 3)),
+    "OpenGL's: y up, z backward": Axes(_axes(1, -2, -3)),
+    "LiDAR's: x forward, y left, z up": Axes(_axes(-2, -3, 1)),
+    "z up, y forward": Axes(_axes(1, -3, 2)),
 }
+# Of boxes that a motion took to the camera, headings too: from a frame whose x axis points forward, or to the right.
+_X_FORWARD_AXES: dict[str, Axes] = {
+    AS_DOCUMENTED: Axes(),
+    "y to the right (left-handed)": Axes(_axes(-1, 2, 3), lambda yaw: np.pi - yaw),
+    "a camera's: x right, y down, z forward": Axes(_axes(3, -1, -2), lambda yaw: -yaw - np.pi / 2),
+    "x right, y forward, z up": Axes(_axes(3, 2, -1), lambda yaw: yaw + np.pi / 2),
+}
+_X_RIGHT_AXES: dict[str, Axes] = {
+    AS_DOCUMENTED: Axes(),
+    "x to the left (left-handed)": Axes(_axes(-1, 2, 3), lambda yaw: np.pi - yaw),
+    "a camera's: x right, y down, z forward": Axes(_axes(1, 3, -2), np.negative),
+    "x forward, y left, z up": Axes(_axes(-3, 2, 1), lambda yaw: yaw - np.pi / 2),
+}
+_DOWN = np.array([0.0, 1.0, 0.0])
 # Share of the height that is to be added to y.
-ORIGINS: dict[str, float] = {AS_DOCUMENTED: 0.0, "centre of the box": 0.5, "top of the box": 1.0}
+ORIGINS: dict[str, float] = {AS_DOCUMENTED: 0.0, "lower by a half": 0.5, "lower by a height": 1.0, "higher": -0.5}
+_POINTS = {0.0: "centre of the bottom face", 0.5: "centre of the box", 1.0: "top of the box"}
 YAWS: dict[str, Callable[[Angles], Angles]] = {
     AS_DOCUMENTED: _identity,
     "opposite sign": lambda yaw: -yaw,
     "offset by 90 degrees": lambda yaw: yaw + np.pi / 2,
-    "opposite sign and offset by 90 degrees (LiDAR's)": lambda yaw: -yaw - np.pi / 2,
+    "opposite sign and offset by 90 degrees": lambda yaw: -yaw - np.pi / 2,
     "degrees": np.deg2rad,
     "degrees, opposite sign": lambda yaw: -np.deg2rad(yaw),
 }
-# The order of the file; which of its columns are h, w, l.
+# The order in the place of h w l; which of these are h, w, l.
 ORDERS: dict[str, tuple[int, int, int]] = {
     AS_DOCUMENTED if order == "hwl" else " ".join(order): (order.index("h"), order.index("w"), order.index("l"))
     for order in map("".join, permutations("hwl"))
@@ -78,22 +106,45 @@ class BoxConvention:
         """The parts that are not as documented."""
         return {part: value for part, value in vars(self).items() if value not in (AS_DOCUMENTED, 1.0)}
 
-    def to_kitti(self, boxes: CarBoxes) -> CarBoxes:
-        """The boxes as they should have been written, if this is how they were."""
+    def to_kitti(self, boxes: CarBoxes, form: BoxForm) -> CarBoxes:
+        """The boxes as they should have been read, if this is how those of a form were written."""
         hwl = self.size * boxes.hwl[:, list(ORDERS[self.order])]
-        location = self.distance * AXES[self.axes](boxes.location)
-        location[:, 1] += ORIGINS[self.origin] * hwl[:, 0]
-        return CarBoxes(location, hwl, YAWS[self.yaw](boxes.rotation_y), boxes.alpha, boxes.box_2d)
+        axes = _axes_of(form)[self.axes]
+        # From the bottom, which was taken to be as far below the location as the height says, to the location and back.
+        location = boxes.location - form.raised * boxes.hwl[:, :1] * _DOWN
+        location = self.distance * axes.points(location)
+        location = location + (form.raised + ORIGINS[self.origin]) * hwl[:, :1] * _DOWN
+        yaw = axes.yaw(YAWS[self.yaw](boxes.rotation_y))
+        return CarBoxes(location, hwl, yaw, boxes.alpha, boxes.box_2d)
 
 
-def all_conventions() -> tuple[BoxConvention, ...]:
+def _axes_of(form: BoxForm) -> dict[str, Axes]:
+    if not form.upright:
+        return _CAMERA_AXES
+    return _X_FORWARD_AXES if form.heading_of_right else _X_RIGHT_AXES
+
+
+def all_conventions(form: BoxForm) -> tuple[BoxConvention, ...]:
     """Every combination of axes, origin, heading and order, the documented one first; then single factors."""
+    origins = [name for name, share in ORIGINS.items() if share + form.raised in _POINTS]
     return (
-        *(BoxConvention(*parts) for parts in product(AXES, ORIGINS, YAWS, ORDERS)),
+        *(BoxConvention(*parts) for parts in product(_axes_of(form), origins, YAWS, ORDERS)),
         *(BoxConvention(focal=factor) for factor in FOCALS),
         *(BoxConvention(distance=factor) for factor in DISTANCES),
         *(BoxConvention(size=factor) for factor in SIZES),
     )
+
+
+def spoken(part: str, value: str | float, form: BoxForm) -> str:
+    """A deviation in the words of how boxes are written."""
+    if part == "origin":
+        return _POINTS[ORIGINS[str(value)] + form.raised]
+    if part == "order":
+        in_place = dict(zip("hwl", str(value).split(), strict=True))
+        return " ".join(in_place[size] for size in form.sizes)
+    if part == "yaw" and value == "opposite sign and offset by 90 degrees":
+        return f"{value} ({'a camera' if form.upright else 'LiDAR'}'s)"
+    return str(value)
 
 
 # Rather the documented convention than one that explains the same a little better.
@@ -130,7 +181,7 @@ def score_conventions(frames: Sequence[FrameEvidence]) -> ConventionScores:
     What the image shows are the 2D box of the detection and the masks, whichever fits best; where the 2D boxes were
     only projected from the 3D ones, the masks alone, and as many cars as there are masks.
     """
-    conventions = all_conventions()
+    conventions = all_conventions(frames[0].words.form)
     projections = boxes_are_projections(frames)
     overlap = np.concatenate([_overlaps(frame, conventions, projections) for frame in frames], axis=1)
     median_hwl = np.median(np.concatenate([frame.boxes.hwl for frame in frames]), axis=0)
@@ -138,7 +189,10 @@ def score_conventions(frames: Sequence[FrameEvidence]) -> ConventionScores:
     alpha, angle_share = np.concatenate([frame.boxes.alpha for frame in frames]), None
     if (np.abs(alpha) <= _MAX_ANGLE_RAD).all() and (len(alpha) == 1 or np.ptp(alpha) > 0):  # not of NaN
         # Neither origin nor order changes an angle seen from above.
-        share = {(axes, yaw): _angles_agree(BoxConvention(axes, yaw=yaw), frames) for axes, yaw in product(AXES, YAWS)}
+        share = {
+            (axes, yaw): _angles_agree(BoxConvention(axes, yaw=yaw), frames)
+            for axes, yaw in product({each.axes for each in conventions}, YAWS)
+        }
         angle_share = np.array([share[convention.axes, convention.yaw] for convention in conventions])
     return ConventionScores(conventions, overlap, overlap.mean(axis=1) - penalty, angle_share)
 
@@ -146,7 +200,7 @@ def score_conventions(frames: Sequence[FrameEvidence]) -> ConventionScores:
 def _angles_agree(convention: BoxConvention, frames: Sequence[FrameEvidence]) -> float:
     """Share of the cars with `alpha = rotation_y - atan2(x, z)`, about."""
     agree = []
-    for boxes in (convention.to_kitti(frame.boxes) for frame in frames):
+    for boxes in (convention.to_kitti(frame.boxes, frame.words.form) for frame in frames):
         expected = boxes.rotation_y - np.arctan2(boxes.location[:, 0], boxes.location[:, 2])
         difference = np.angle(np.exp(1j * (boxes.alpha - expected)))
         agree.append(np.abs(difference) < _ANGLE_TOLERANCE_RAD)
@@ -199,7 +253,7 @@ def project_conventions(
         return projected
     for focal in {convention.focal for convention in conventions}:
         rows = [row for row, convention in enumerate(conventions) if convention.focal == focal]
-        found = [conventions[row].to_kitti(frame.boxes) for row in rows]
+        found = [conventions[row].to_kitti(frame.boxes, frame.words.form) for row in rows]
         T_cam_obj = pose_from_kitti(
             torch.from_numpy(np.concatenate([boxes.location for boxes in found])) + frame.camera.t_cam_ref[0],
             torch.from_numpy(np.concatenate([boxes.rotation_y for boxes in found])),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
+
+from directshape_torch.scene_check.words import Says, Words
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
@@ -21,6 +23,7 @@ class Finding:
         measured: what was found, with numbers.
         expected: what it should have been.
         cure: how to mend it.
+        places: of a finding that stands for several of its kind each of their `where`, in order; else empty.
     """
 
     check: str
@@ -29,16 +32,16 @@ class Finding:
     measured: str
     expected: str
     cure: str
+    places: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         """One line."""
         return f"{self.severity}: {self.check} ({self.where}): {self.measured}; expected {self.expected}; {self.cure}"
 
-    def block(self, count: int) -> str:
-        """Four lines, for it and others of its kind."""
-        more = f" and {count - 1} more" if count > 1 else ""
+    def block(self) -> str:
+        """Four lines."""
         return (
-            f"{self.severity}: {self.check} ({self.where}{more})\n"
+            f"{self.severity}: {self.check} ({self.where})\n"
             f"  measured  {self.measured}\n"
             f"  expected  {self.expected}\n"
             f"  cure      {self.cure}\n"
@@ -72,16 +75,11 @@ class CheckReport:
         return sum(finding.severity == severity for finding in self.findings)
 
     def __str__(self) -> str:
-        """One block a finding, of findings about single frames one a kind with the first in full, and a last line."""
-        groups: dict[tuple[str, ...], list[Finding]] = {}
-        for finding in self.findings:
-            is_of_frame = finding.where.split()[0] == "frame"
-            kind = ("frame",) if is_of_frame else (finding.where, finding.measured)
-            groups.setdefault((finding.severity, finding.check, *kind), []).append(finding)
+        """One block a finding, and a last line."""
         counts = ", ".join(f"{n} {name}{'' if n == 1 else 's'}" for name in SEVERITIES for n in [self.count(name)])
         of = "" if self.num_checked == self.num_frames else f" of {self.num_frames}"
         last = f"{counts} in {self.num_checked}{of} frames with {self.num_cars} cars"
-        return "\n".join([*(findings[0].block(len(findings)) for findings in groups.values()), last])
+        return "\n".join([*(finding.block() for finding in self.findings), last])
 
     @property
     def exit_code(self) -> int:
@@ -90,8 +88,21 @@ class CheckReport:
 
 
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Errors, then warnings, then notes; else in their order."""
-    return tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
+    """Errors, then warnings, then notes; else in their order. Findings of one kind about single frames are one."""
+    groups: dict[tuple[str, ...], list[Finding]] = {}
+    for finding in findings:
+        kind = ("frame",) if finding.where.split()[0:1] == ["frame"] else (finding.where, finding.measured)
+        groups.setdefault((finding.severity, finding.check, *kind), []).append(finding)
+    return tuple(sorted(map(_merged, groups.values()), key=lambda finding: SEVERITIES.index(finding.severity)))
+
+
+def _merged(findings: Sequence[Finding]) -> Finding:
+    """The first of several, with the places of all."""
+    first = findings[0]
+    if len(findings) == 1:
+        return first
+    places = tuple(finding.where for finding in findings)
+    return replace(first, where=f"{first.where} and {len(findings) - 1} more", places=places)
 
 
 def names(findings: Iterable[Finding]) -> set[str]:
@@ -100,11 +111,14 @@ def names(findings: Iterable[Finding]) -> set[str]:
 
 
 class Mistake(NamedTuple):
-    """A kind of mistake. What depends on the case is in braces, for `str.format`."""
+    """A kind of mistake. What depends on the case is in braces, for `str.format`.
+
+    Kinds without words here have them in `Words`, as they are mended differently in each source of data.
+    """
 
     severity: Severity
-    expected: str
-    cure: str
+    expected: str = ""
+    cure: str = ""
 
 
 MISTAKES: dict[str, Mistake] = {
@@ -113,21 +127,19 @@ MISTAKES: dict[str, Mistake] = {
         "the same within 5 percent, as rectified images have",
         "scale fx, cx with the width and fy, cy with the height of resized images",
     ),
+    "raw_intrinsics": Mistake(
+        "error",
+        "the intrinsics of the rectified images: one focal length and one row of the centre for both",
+        "give K = P[:, :3] of the rectified cameras, not K of the raw ones (a ROS camera_info has both, OpenCV's "
+        "stereoRectify returns P1 and P2), and the baseline -P_right[0, 3] / P_right[0, 0]",
+    ),
     "principal_point": Mistake(
         "warning",
         "near the middle of the image",
         "use the intrinsics of this size of image; cutting moves the point, resizing scales it",
     ),
-    "baseline_sign": Mistake(
-        "error",
-        "a positive baseline: P3[0, 3] / fx below P2[0, 3] / fx",
-        "swap P2 and P3, or flip the sign of the fourth columns",
-    ),
-    "baseline_length": Mistake(
-        "error",
-        "{low} to {high} m",
-        "give it in metres; the fourth column of P3 is -fx times the baseline, not the baseline",
-    ),
+    "baseline_sign": Mistake("error"),
+    "baseline_length": Mistake("error"),
     "images_swapped": Mistake(
         "error",
         "disparities u_left - u_right above 0: everything lies farther left in the right image",
@@ -171,42 +183,18 @@ MISTAKES: dict[str, Mistake] = {
         "left boxes that fit left masks, and cars farther left in the right image",
         "swap the two sides of the masks (or detections and masks were made on the right image)",
     ),
-    "no_masks": Mistake(
-        "error",
-        "masks of the left images, better of both",
-        "check the side ('image') and the class (category_id 3, or 1 and 26 in PNG) of the masks",
-    ),
+    "no_masks": Mistake("error"),
     "box_2d": Mistake("error", "u_min v_min u_max v_max, pixels", "add x to the width and y to the height"),
-    "box_axes": Mistake(
-        "error",
-        "x right, y down, z forward, metres, in the frame of the rectified camera",
-        "turn locations to x right, y down, z forward before writing them",
-    ),
-    "box_origin": Mistake(
-        "error",
-        "the centre of the box's bottom face",
-        "write the centre of the bottom face: add half a height to y of a centre (y points down)",
-    ),
-    "box_yaw": Mistake(
-        "error",
-        "rotation_y in radians about the y axis, 0 where the car drives along +x, -pi/2 where it drives along +z",
-        "convert headings: negate them, add or subtract pi / 2, or turn degrees into radians as found here",
-    ),
-    "box_order": Mistake("error", "height, width, length", "write height, width, length in this order"),
-    "box_units": Mistake("error", "{low} to {high} m", "write metres (for larger vehicles use --classes)"),
-    "box_projection": Mistake(
-        "error",
-        "at least {limit}",
-        "check that detections, masks, images and calibration are of the same frames; then frame, origin and units",
-    ),
+    "box_axes": Mistake("error"),
+    "box_origin": Mistake("error"),
+    "box_yaw": Mistake("error"),
+    "box_order": Mistake("error"),
+    "box_units": Mistake("error"),
+    "box_projection": Mistake("error"),
     "missing_files": Mistake(
         "error", "every frame to have all of its files", "add them, or leave the frames out with --split or --frames"
     ),
-    "no_cars": Mistake(
-        "error",
-        "lines of class Car (or --classes) with positive h w l and a location",
-        "check names of classes and the folder of detections",
-    ),
+    "no_cars": Mistake("error"),
     "rig_offset": Mistake(
         "warning",
         "within {limit} px",
@@ -231,18 +219,21 @@ def found(
     where: str,
     measured: str,
     *,
+    words: Words | None = None,
     severity: Severity | None = None,
     expected: str = "",
     cure: str = "",
     **numbers: float | str,
 ) -> Finding:
-    """A finding with what the table says of its kind, unless something else is said here."""
+    """A finding with what the table or the words of its source say of its kind, unless something else is said here."""
     kind = MISTAKES[check]
+    own = {} if words is None else words.says
+    says = Says(kind.expected, kind.cure) if kind.expected else own[check]
     return Finding(
         check,
         severity or kind.severity,
         where,
         measured,
-        expected or kind.expected.format(**numbers),
-        cure or kind.cure,
+        expected or says.expected.format(**numbers),
+        cure or says.cure,
     )

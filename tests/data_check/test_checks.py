@@ -27,6 +27,7 @@ from directshape_torch.io.stereo_dataset import LayoutName, open_dataset
 from directshape_torch.scene_check.check_images import PairMatches, check_calibration, check_pair
 from directshape_torch.scene_check.check_places import check_distances
 from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, unreadable
+from directshape_torch.scene_check.words import KITTI_FILES
 
 SIZE_HW = (400, 1200)
 K = np.array([[700.0, 0, 600], [0, 700, 200], [0, 0, 1]])
@@ -113,7 +114,7 @@ def test_rows_may_differ_as_the_calibration_says() -> None:
     ],
 )
 def test_calibrations(found: KittiCalibration, expected: list[str]) -> None:
-    findings = check_calibration(*numbers_of(found), SIZE_HW, "frame 1")
+    findings = check_calibration(*numbers_of(found), SIZE_HW, "frame 1", KITTI_FILES)
     assert [finding.check for finding in findings] == expected
     assert all(finding.where == "frame 1" or "of calib.txt" in finding.where for finding in findings)
 
@@ -154,17 +155,87 @@ def test_a_rig_file_of_images_of_another_size_is_one_finding(kitti: Path, tmp_pa
     assert finding.measured.endswith("rig.json: is of images of 80 x 60 pixels, they have 160 x 120")
 
 
+FOCAL_RIGHT = np.diag([1.01, 1.01, 1.0]) @ K
+
+
+def test_matches_may_differ_as_differing_focal_lengths_say() -> None:
+    """A right lens that magnifies by a hundredth shows points farther from its centre."""
+    pair, cameras = matches(), camera(calibration(right=FOCAL_RIGHT))
+    magnified = PairMatches(pair.uv_left, (pair.uv_right - K[:2, 2]) * 1.01 + FOCAL_RIGHT[:2, 2], len(pair))
+    assert check_pair(magnified, None, SIZE_HW, "")[0].check == "not_rectified"
+    assert check_pair(magnified, camera(calibration()), SIZE_HW, "")[0].check == "not_rectified"
+    assert check_pair(magnified, cameras, SIZE_HW, "") == []
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        K + np.array([[0, 0, 0], [0, 0, 6], [0, 0, 0]]),  # the row of the centre
+        K + np.array([[0, 0, -25], [0, 0, 0], [0, 0, 0]]),  # its column: far points seem to be beyond infinity
+        FOCAL_RIGHT,
+    ],
+)
+def test_intrinsics_of_raw_images_have_one_name(raw: np.ndarray) -> None:
+    """Rectified images with K of the raw cameras, as a camera_info has it beside P."""
+    (finding,) = check_pair(matches(), camera(calibration(right=raw)), SIZE_HW, "frame 1")
+    assert (finding.check, finding.severity) == ("raw_intrinsics", "error")
+    assert "P[:, :3]" in finding.cure
+    assert "-P_right[0, 3] / P_right[0, 0]" in finding.cure
+
+
+def test_intrinsics_that_differ_are_said_without_matches_once(kitti: Path, tmp_path: Path) -> None:
+    for right, severity in ((FOCAL_RIGHT, "warning"), (np.diag([1.2, 1.2, 1.0]) @ K, "error")):
+        findings = check_calibration(*numbers_of(calibration(right=right)), None, "frame 1", KITTI_FILES)
+        assert [(each.check, each.severity) for each in findings] == [("raw_intrinsics", severity)]
+    write_folder(kitti, tmp_path, ("000000", "000001"))
+    path = tmp_path / "rig.json"
+    rig = json.loads(path.read_text())
+    right = [list(row) for row in rig["K_left"]]
+    right[1][2] += 7.0
+    path.write_text(json.dumps(rig | {"K_right": right}))
+    report = check_dataset(open_dataset("folder", tmp_path))
+    (finding,) = (each for each in report.findings if each.check == "raw_intrinsics")
+    assert finding.where == "frame 000000 and 1 more"
+    assert finding.places == ("frame 000000", "frame 000001")
+
+
+@pytest.mark.parametrize(
+    ("change", "check", "words"),
+    [
+        ({"baseline_m": -0.5, "t_right_cam_m": None}, "baseline_sign", "give baseline_m as a distance without sign"),
+        ({"baseline_m": None, "t_right_cam_m": [0.5, 0, 0]}, "baseline_sign", "(-baseline, 0, 0)"),
+        (
+            {"baseline_m": 540.0, "t_right_cam_m": None},
+            "baseline_length",
+            "give baseline_m (or t_right_cam_m) in metres",
+        ),
+    ],
+)
+def test_a_plain_folder_is_spoken_of_by_its_own_keys(
+    change: dict[str, object], check: str, words: str, kitti: Path, tmp_path: Path
+) -> None:
+    write_folder(kitti, tmp_path, ("000000",))
+    path = tmp_path / "rig.json"
+    rig = {key: value for key, value in (json.loads(path.read_text()) | change).items() if value is not None}
+    path.write_text(json.dumps(rig))
+    report = check_dataset(open_dataset("folder", tmp_path))
+    assert any(each.check == check and words in each.cure for each in report.findings), report
+    assert not any(word in str(report) for word in ("P2", "P3", "rotation_y "))
+
+
 def test_report_in_words() -> None:
     first = Finding("images_swapped", "error", "frame 1", "m", "e", "c")
-    report = CheckReport((first, Finding("images_swapped", "error", "frame 2", "m", "e", "c")), 9, 2, 5)
+    other = Finding("images_swapped", "error", "frame 2, P3 of calib.txt", "m of it", "e", "c")
+    report = CheckReport(by_severity((first, other)), 9, 2, 5)
     assert report.exit_code == 1
+    assert [finding.places for finding in report.findings] == [("frame 1", "frame 2, P3 of calib.txt")]
     assert str(report).splitlines() == [
         "error: images_swapped (frame 1 and 1 more)",
         "  measured  m",
         "  expected  e",
         "  cure      c",
         "",
-        "2 errors, 0 warnings, 0 notes in 2 of 9 frames with 5 cars",
+        "1 error, 0 warnings, 0 notes in 2 of 9 frames with 5 cars",
     ]
 
 
@@ -183,7 +254,7 @@ def test_command(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert "3 errors, 0 warnings, 0 notes in 2 frames with 4 cars" in out
     content = json.loads((tmp_path / "found.json").read_text())
     assert content["schema_version"] == 1
-    assert {"check", "severity", "where", "measured", "expected", "cure"} == set(content["findings"][0])
+    assert {"check", "severity", "where", "measured", "expected", "cure", "places"} == set(content["findings"][0])
     assert main([*command(kitti), "--data", str(tmp_path / "nowhere"), "--json", "-"]) == 1
     (finding,) = json.loads(capsys.readouterr().out)["findings"]
     assert finding["check"] == "layout"

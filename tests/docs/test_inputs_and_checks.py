@@ -8,6 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import get_args
 
+from directshape_torch.geometry.box_formats import box_form
 from directshape_torch.io import folder_files
 from directshape_torch.io.stereo_dataset import LayoutName
 from directshape_torch.scene_check.conventions import all_conventions
@@ -52,4 +53,5 @@ def test_every_finding_is_in_the_table() -> None:
     named |= set(re.findall(r'"(\w+)": files\.', text))  # of the two images
     documented = first_column(CHECKS.split("## Findings")[1].split("## What is said")[0])
     assert named | set(MISTAKES) == documented
-    assert f"in {len(list(all_conventions())) - 1} other ways" in CHECKS
+    camera, lidar = (len(all_conventions(box_form(name))) - 1 for name in ("kitti", "openpcdet"))
+    assert f"in {camera} other ways (from a LiDAR's frame {lidar})" in CHECKS

@@ -1,0 +1,170 @@
+"""A mistake in boxes of any convention is named in the words of that convention, by an error or by a finding."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+from itertools import product
+from pathlib import Path
+from typing import NamedTuple, get_args
+
+import pytest
+import torch
+from scene_mistakes import Scene, scene
+from torch import Tensor
+
+import directshape_torch
+from directshape_torch import CheckReport, Detections, InputError, check_scene
+from directshape_torch.geometry.box_formats import BoxFormat, box_form, poses_to_boxes
+
+DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
+T_CAM_LIDAR = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, -0.1], [1, 0, 0, -0.2], [0, 0, 0, 1]])
+T_CAM_TOP = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1, -0.1], [0, 1, 0, -0.2], [0, 0, 0, 1]])
+CONVENTIONS: tuple[BoxFormat, ...] = get_args(BoxFormat)
+LIDAR: dict[BoxFormat, Tensor] = {
+    "mmdet3d_lidar": T_CAM_LIDAR,
+    "openpcdet": T_CAM_LIDAR,
+    "nuscenes": T_CAM_TOP,
+}
+# What only files of KITTI have.
+FOREIGN = ("rotation_y", "P2", "P3", "--classes", "--split", "category_id")
+
+
+@lru_cache(maxsize=1)
+def demo() -> Scene:
+    return scene(DEMO, DEMO / "detections" / "noisy_stereo", DEMO / "training" / "masks")
+
+
+def said_of(convention: BoxFormat, change: Callable[[Tensor, BoxFormat], Tensor], T: Tensor | None) -> CheckReport:
+    """Of the bundled frame, its boxes written rightly and then changed."""
+    frames, cars = demo()
+    boxes = poses_to_boxes(cars.T_cam_obj, cars.dimensions_hwl, convention, LIDAR.get(convention))
+    given = change(boxes.clone(), convention)
+    written = Detections.from_boxes(
+        given, convention, mask_left=cars.mask_left, mask_right=cars.mask_right, T_cam_boxes=T
+    )
+    return check_scene(frames, written, match_images=False)
+
+
+def up(convention: BoxFormat) -> tuple[int, float]:
+    """The column of a location that is vertical, and its sign upwards."""
+    return (2, 1.0) if convention in LIDAR else (1, -1.0)
+
+
+def other_point(boxes: Tensor, convention: BoxFormat) -> Tensor:
+    """The centre for the bottom, or the bottom for the centre."""
+    column, sign = up(convention)
+    height = boxes[:, 3 + box_form(convention).sizes.index("h")]
+    boxes[:, column] += sign * height * (-0.5 if box_form(convention).raised else 0.5)
+    return boxes
+
+
+def top(boxes: Tensor, convention: BoxFormat) -> Tensor:
+    column, sign = up(convention)
+    height = boxes[:, 3 + box_form(convention).sizes.index("h")]
+    boxes[:, column] += sign * height * (1 - box_form(convention).raised)
+    return boxes
+
+
+def order(boxes: Tensor, convention: BoxFormat, wanted: str) -> Tensor:
+    sizes = box_form(convention).sizes
+    boxes[:, 3:6] = boxes[:, [3 + sizes.index(size) for size in wanted]]
+    return boxes
+
+
+def wrong_order(convention: BoxFormat) -> str:
+    """One that makes the length another column, which shows in the image."""
+    sizes = box_form(convention).sizes
+    return sizes[1:] + sizes[:1]
+
+
+def turned(boxes: Tensor, _: BoxFormat) -> Tensor:
+    boxes[:, 6] += math.pi / 2
+    return boxes
+
+
+def scaled(boxes: Tensor, factor: float, columns: slice) -> Tensor:
+    boxes[:, columns] *= factor
+    return boxes
+
+
+class Case(NamedTuple):
+    """A mistake, the check that names it, and words of what is said."""
+
+    change: Callable[[Tensor, BoxFormat], Tensor]
+    check: str
+    words: Callable[[BoxFormat], str]
+
+
+CASES = {
+    "another point of the box": Case(
+        other_point,
+        "box_origin",
+        lambda c: f"read as 'centre of the {'bottom face' if box_form(c).raised else 'box'}'",
+    ),
+    "top of the box": Case(top, "box_origin", lambda c: f"expected {box_form(c).place}"),
+    "sizes in another order": Case(
+        lambda boxes, c: order(boxes, c, wrong_order(c)),
+        "box_order",
+        lambda c: f"read as '{' '.join(wrong_order(c))}'",
+    ),
+    "order is expected": Case(
+        lambda boxes, c: order(boxes, c, wrong_order(c)), "box_order", lambda c: f"expected {box_form(c).order}"
+    ),
+    "headings turned": Case(turned, "box_yaw", lambda c: f"expected {box_form(c).heading}"),
+    "millimetres": Case(lambda boxes, _: scaled(boxes, 1000, slice(0, 6)), "box_units", lambda _: "give metres"),
+    "places in millimetres": Case(
+        lambda boxes, _: scaled(boxes, 1000, slice(0, 3)), "box_units", lambda _: "multiplied by 0.001"
+    ),
+    "half sizes": Case(lambda boxes, _: scaled(boxes, 0.5, slice(3, 6)), "box_units", lambda _: "metres"),
+}
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_right_boxes_raise_no_alarm(convention: BoxFormat) -> None:
+    assert said_of(convention, lambda boxes, _: boxes, LIDAR.get(convention)).findings == ()
+
+
+@pytest.mark.parametrize(("convention", "name"), [*product(CONVENTIONS, CASES)])
+def test_a_mistake_is_named_in_the_words_of_the_convention(convention: BoxFormat, name: str) -> None:
+    case = CASES[name]
+    report = said_of(convention, case.change, LIDAR.get(convention))
+    said = [str(finding) for finding in report.findings if finding.check == case.check]
+    assert any(case.words(convention) in text for text in said), report
+    foreign = FOREIGN[1:] if convention == "kitti" else FOREIGN
+    assert not any(word in str(report) for word in foreign), report
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_axes_of_another_frame(convention: BoxFormat) -> None:
+    """Boxes of a camera for those of a LiDAR, and the other way round."""
+    frames, cars = demo()
+    source: BoxFormat = "openpcdet" if convention not in LIDAR else "opencv"
+    boxes = poses_to_boxes(cars.T_cam_obj, cars.dimensions_hwl, source, LIDAR.get(source))
+    form = box_form(convention)
+    sizes = boxes[:, [3 + "lwh".index(size) for size in form.sizes]]
+    column, sign = up(source)
+    boxes[:, column] -= sign * (0.5 - form.raised) * cars.dimensions_hwl[:, 0]
+    boxes = torch.cat([boxes[:, :3], sizes, boxes[:, 6:]], dim=1)
+    found = Detections.from_boxes(
+        boxes, convention, mask_left=cars.mask_left, mask_right=cars.mask_right, T_cam_boxes=LIDAR.get(convention)
+    )
+    report = check_scene(frames, found, match_images=False)
+    said = [finding for finding in report.findings if finding.check == "box_axes"]
+    assert said, report
+    assert ("a camera's" if convention in LIDAR else "LiDAR's") in said[0].measured
+    assert said[0].expected == form.frame
+    assert ("T_cam_boxes" in said[0].cure) == (convention in LIDAR)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_what_no_image_is_needed_for_is_refused_at_once(convention: BoxFormat) -> None:
+    T = LIDAR.get(convention)
+    inverse = T_CAM_LIDAR if T is None else T.inverse()
+    with pytest.raises(InputError, match=rf"T_cam_boxes: .*'{convention}' boxes .*not its inverse"):
+        said_of(convention, lambda boxes, _: boxes, inverse)
+    with pytest.raises(InputError, match=rf"sizes of '{convention}' boxes are {box_form(convention).order}"):
+        said_of(convention, lambda boxes, _: scaled(boxes, 0, slice(3, 4)), T)
+    with pytest.raises(InputError, match=rf"give x, y, z, {box_form(convention).order} and heading"):
+        said_of(convention, lambda boxes, _: boxes[:, :6], T)
