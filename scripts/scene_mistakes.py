@@ -102,6 +102,18 @@ def _focal(scale: float) -> Callable[..., Scene]:
     return _intrinsics(scale, columns=2)
 
 
+def _raw_intrinsics(frames: FrameBatch, d: Detections) -> Scene:
+    """K of two raw cameras for that of the images rectified from theirs: each off in its own way."""
+    camera = frames.camera
+    changed = {}
+    for name, scale, centre in (("K_left", 1.02, (9.0, 4.0)), ("K_right", 1.03, (-5.0, -3.0))):
+        K = getattr(camera, name).clone()
+        K[:, :2, :2] *= scale
+        K[:, :2, 2] += K.new_tensor(centre)
+        changed[name] = K
+    return replace(frames, camera=replace(camera, **changed)), d
+
+
 def _baseline(scale: float) -> Callable[..., Scene]:
     def make(frames: FrameBatch, d: Detections) -> Scene:
         T = frames.camera.T_right_cam.clone()
@@ -182,6 +194,7 @@ MISTAKES: dict[str, Mistake] = {
     ),
     "focal length 0.8 times too short": Mistake(_focal(0.8), ("focal_length", "multiplied by 1.25")),
     "focal length 1.25 times too long": Mistake(_focal(1.25), ("focal_length", "multiplied by 0.8")),
+    "K of the raw cameras": Mistake(_raw_intrinsics, ("raw_intrinsics", "P[:, :3]"), True),
     "focal length in millimetres": Mistake(_focal(0.005), ("focal_length", "millimetres")),
     "fy half of fx": Mistake(_intrinsics(0.5, 1), ("focal_length", "resized images")),
     "baseline 1.5 times too long": Mistake(_baseline(1.5), ("distance_scale", "the baseline is wrong")),

@@ -23,7 +23,13 @@ from directshape_torch.io.mask_matching import MIN_OVERLAP, assign
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.scene import SIDES
 from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence, Pair
-from directshape_torch.scene_check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, check_images
+from directshape_torch.scene_check.check_images import (
+    SPOILS_CAMERA,
+    SPOILS_PAIR,
+    check_calibration,
+    check_images,
+    without_doubts,
+)
 from directshape_torch.scene_check.finding import Finding, names, unreadable
 from directshape_torch.scene_check.words import Words, words_of_files
 
@@ -77,7 +83,8 @@ def check_frame(dataset: StereoDataset, frame_id: str) -> tuple[list[Finding], i
     # A wrong calibration must not spoil what the images say by themselves.
     camera = None if names(findings) & SPOILS_CAMERA else camera
     if pair is not None:
-        findings += check_images(*pair, camera, attempt.where)
+        of_pair = check_images(*pair, camera, attempt.where)
+        findings = [*without_doubts(findings, of_pair), *of_pair]
     cars = [o for o in objects or [] if o.type in dataset.classes and o.has_box_3d]
     if camera is None or size_hw is None:
         return findings, len(cars), None

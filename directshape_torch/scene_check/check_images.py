@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,10 @@ from directshape_torch.scene_check.words import Words
 # With these wrong, what disparities and projections show says nothing more.
 SPOILS_CAMERA = frozenset({"raw_intrinsics", "baseline_sign", "baseline_length", "focal_length", "principal_point"})
 SPOILS_PAIR = frozenset(
-    {"images_swapped", "image_mirrored", "same_image", "different_scenes", "not_rectified", "few_matches"}
+    {
+        *("images_swapped", "image_mirrored", "same_image", "different_scenes", "not_rectified", "few_matches"),
+        "raw_intrinsics",
+    }
 )
 # Lenses from 15 to 150 degrees of view across the image.
 FOCAL_SHARES = (0.13, 3.8)
@@ -97,6 +100,16 @@ def _check_alike(cameras: Mapping[str, NDArray[np.float64]], where: str) -> list
     measured = f"left and right differ: fx = {fx}, fy = {fy}, cy = {cy} px"
     severity: Severity = "error" if scale > ASPECT_TOLERANCE else "warning"
     return [found("raw_intrinsics", where, measured, severity=severity)]
+
+
+def without_doubts(of_numbers: Sequence[Finding], of_pair: Sequence[Finding]) -> list[Finding]:
+    """What numbers show, but doubts about intrinsics that matches have settled."""
+    settled = not any(finding.check == "few_matches" for finding in of_pair)
+    return [
+        finding
+        for finding in of_numbers
+        if not (settled and finding.check == "raw_intrinsics" and finding.severity == "warning")
+    ]
 
 
 def _check_centre(centre: tuple[float, float], size_wh: tuple[int, int], where: str) -> list[Finding]:

@@ -11,7 +11,13 @@ from directshape_torch.numerics.checks import check_type
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.scene_check.car_evidence import FrameEvidence, evidence_of_scene
 from directshape_torch.scene_check.check_boxes import check_box_2d, check_boxes, check_corners
-from directshape_torch.scene_check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, check_images
+from directshape_torch.scene_check.check_images import (
+    SPOILS_CAMERA,
+    SPOILS_PAIR,
+    check_calibration,
+    check_images,
+    without_doubts,
+)
 from directshape_torch.scene_check.check_masks import check_masks
 from directshape_torch.scene_check.check_places import check_distances, check_heading, check_swapped, measure_cars
 from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, names
@@ -65,7 +71,8 @@ def check_scene(
     usable = not names(found) & SPOILS_CAMERA
     for one in evidence:
         if match_images and one.pair is not None:
-            found += check_images(*one.pair, one.camera if usable else None, f"frame {one.frame_id}")
+            of_pair = check_images(*one.pair, one.camera if usable else None, f"frame {one.frame_id}")
+            found = [*without_doubts(found, of_pair), *of_pair]
     found += _mask_sizes(frames, detections)
     if usable and not names(found) & {"mask_size"}:
         spoilt = bool(names(found) & SPOILS_PAIR)

@@ -52,18 +52,16 @@ _CAMERA_AXES: dict[str, Axes] = {
     "LiDAR's: x forward, y left, z up": Axes(_axes(-2, -3, 1)),
     "z up, y forward": Axes(_axes(1, -3, 2)),
 }
-# Of boxes that a motion took to the camera, headings too: from a frame whose x axis points forward, or to the right.
-_X_FORWARD_AXES: dict[str, Axes] = {
+_A_CAMERAS = "a camera's: x right, y down, z forward"
+# Of boxes that a motion took to the camera, headings too, from a frame with z up.
+_UPRIGHT_AXES: dict[str, Axes] = {
     AS_DOCUMENTED: Axes(),
-    "y to the right (left-handed)": Axes(_axes(-1, 2, 3), lambda yaw: np.pi - yaw),
-    "a camera's: x right, y down, z forward": Axes(_axes(3, -1, -2), lambda yaw: -yaw - np.pi / 2),
-    "x right, y forward, z up": Axes(_axes(3, 2, -1), lambda yaw: yaw + np.pi / 2),
-}
-_X_RIGHT_AXES: dict[str, Axes] = {
-    AS_DOCUMENTED: Axes(),
-    "x to the left (left-handed)": Axes(_axes(-1, 2, 3), lambda yaw: np.pi - yaw),
-    "a camera's: x right, y down, z forward": Axes(_axes(1, 3, -2), np.negative),
-    "x forward, y left, z up": Axes(_axes(-3, 2, 1), lambda yaw: yaw - np.pi / 2),
+    "left-handed, sideways the other way round": Axes(_axes(-1, 2, 3), lambda yaw: np.pi - yaw),
+    "left-handed, ahead the other way round": Axes(_axes(1, 2, -3), np.negative),
+    "turned by -90 degrees about z": Axes(_axes(3, 2, -1), lambda yaw: yaw + np.pi / 2),
+    "turned by 90 degrees about z": Axes(_axes(-3, 2, 1), lambda yaw: yaw - np.pi / 2),
+    f"{_A_CAMERAS}, not x forward, y left, z up": Axes(_axes(3, -1, -2), lambda yaw: -yaw - np.pi / 2),
+    f"{_A_CAMERAS}, not x right, y forward, z up": Axes(_axes(1, 3, -2), np.negative),
 }
 _DOWN = np.array([0.0, 1.0, 0.0])
 # Share of the height that is to be added to y.
@@ -119,9 +117,7 @@ class BoxConvention:
 
 
 def _axes_of(form: BoxForm) -> dict[str, Axes]:
-    if not form.upright:
-        return _CAMERA_AXES
-    return _X_FORWARD_AXES if form.heading_of_right else _X_RIGHT_AXES
+    return _UPRIGHT_AXES if form.upright else _CAMERA_AXES
 
 
 def all_conventions(form: BoxForm) -> tuple[BoxConvention, ...]:

@@ -109,6 +109,14 @@ def masks(**changes: Callable[[Any], Any]) -> Break:
     return text(MASKS, lambda content: json.dumps([changed(entry) for entry in json.loads(content)]))
 
 
+def raw_right(content: str) -> str:
+    """Another row and column of the centre of P3."""
+    lines = [line.split() for line in content.splitlines()]
+    for words in (words for words in lines if words[0] == "P3:"):
+        words[3], words[7] = f"{float(words[3]) - 14}", f"{float(words[7]) - 7}"
+    return "".join(" ".join(words) + "\n" for words in lines)
+
+
 def cut(name: str) -> Break:
     return lambda root: (root / name).write_bytes((root / name).read_bytes()[: (root / name).stat().st_size // 2])
 
@@ -122,6 +130,7 @@ BREAKS: dict[str, tuple[Break, str, bool]] = {
         "baseline_sign",
         False,
     ),
+    "K of the raw cameras": (text(CALIBRATION, raw_right), "raw_intrinsics", True),
     "box centre for bottom": (boxes(centre), "box_origin", True),
     "2D boxes as x y width height": (boxes(corner_and_size), "box_2d", False),
     "classes in lower case": (text(BOXES, str.lower), "no_cars", False),

@@ -158,6 +158,34 @@ def test_axes_of_another_frame(convention: BoxFormat) -> None:
     assert ("T_cam_boxes" in said[0].cure) == (convention in LIDAR)
 
 
+def quarter_turn(degrees: int) -> Tensor:
+    """The motion of a frame with z up to one that is turned about z."""
+    c, s = round(math.cos(math.radians(degrees))), round(math.sin(math.radians(degrees)))
+    return torch.tensor([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float32)
+
+
+@pytest.mark.parametrize(("convention", "degrees"), [*product(LIDAR, (90, -90))])
+def test_a_motion_from_a_frame_whose_x_axis_points_elsewhere(convention: BoxFormat, degrees: int) -> None:
+    T = LIDAR[convention] @ quarter_turn(degrees)
+    report = said_of(convention, lambda boxes, _: boxes, T)
+    (finding,) = (each for each in report.findings if each.check == "box_axes")
+    assert f"read as 'turned by {-degrees} degrees about z'" in finding.measured
+    assert "T_cam_boxes" in finding.cure
+
+
+@pytest.mark.parametrize("convention", LIDAR)
+def test_left_handed_axes(convention: BoxFormat) -> None:
+    def mirrored(boxes: Tensor, _: BoxFormat) -> Tensor:
+        sideways = 1 if convention != "nuscenes" else 0
+        boxes[:, sideways] *= -1
+        boxes[:, 6] = -boxes[:, 6] if sideways else math.pi - boxes[:, 6]
+        return boxes
+
+    report = said_of(convention, mirrored, LIDAR[convention])
+    (finding,) = (each for each in report.findings if each.check == "box_axes")
+    assert "read as 'left-handed, sideways the other way round'" in finding.measured
+
+
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_what_no_image_is_needed_for_is_refused_at_once(convention: BoxFormat) -> None:
     T = LIDAR.get(convention)
