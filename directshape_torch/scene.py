@@ -86,9 +86,11 @@ class FrameBatch(TensorRecord):
         check_type("ground", self.ground, (GroundPlane,))
         for name, count in (("camera", self.camera.num_frames), ("ground", len(self.ground.normal))):
             if count != num_frames:
-                raise InputError(name, f"{num_frames} frames", f"{count}")
+                cure = f"give one for each of the {num_frames} left images"
+                raise InputError(name, f"{num_frames} frames", f"{count}", cure)
         if num_frames and bool(((self.sizes > self.sizes.new_tensor([height, width])) | (self.sizes < 1)).any()):
-            raise InputError("sizes", f"(height, width) within (1..{height}, 1..{width})", str(self.sizes.tolist()))
+            expected, cure = f"(height, width) within (1..{height}, 1..{width})", "height comes first, without padding"
+            raise InputError("sizes", expected, str(self.sizes.tolist()), cure)
         _check_motion(self.time_s, self.T_world_cam)
         field = self.camera.disparity_field
         if field is not None:

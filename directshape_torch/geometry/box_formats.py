@@ -156,7 +156,8 @@ def box_form(convention: str) -> BoxForm:
         InputError: an unknown convention.
     """
     if not isinstance(convention, str) or convention not in _FORMS:
-        raise InputError("convention", f"one of {', '.join(get_args(BoxFormat))}", repr(convention))
+        cure = "bring boxes of another kind into one of these, or give Detections poses T_cam_obj and dimensions_hwl"
+        raise InputError("convention", f"one of {', '.join(get_args(BoxFormat))}", repr(convention), cure)
     return _FORMS[convention]
 
 

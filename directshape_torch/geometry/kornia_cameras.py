@@ -25,7 +25,11 @@ def stereo_camera_of(
     """See `StereoCamera.from_kornia`."""
     if isinstance(left, kornia_camera.StereoCamera):
         if right is not None:
-            raise InputError("right", "None beside kornia's StereoCamera, which has both", type(right).__name__)
+            expected, cure = (
+                "None beside kornia's StereoCamera, which has both",
+                "leave it out, or give two PinholeCamera",
+            )
+            raise InputError("right", expected, type(right).__name__, cure)
         projections = left.rectified_left_camera, left.rectified_right_camera
         return StereoCamera.from_projections(*projections, disparity_field)
     pair = _pinhole("left", left), _pinhole("right", right)

@@ -116,12 +116,15 @@ def _object(path: Path, where: str, entry: Any) -> FolderObject:
         entry = {"object_class" if key == "class" else key: value for key, value in entry.items()}
     found = record_of(path, FolderObject, entry, _CURE, where)
     if len(found.object_class.split()) != 1:
-        raise DataFormatError(path, f"{where}class is {shown(found.object_class)}, expected one word such as 'Car'")
+        problem = f"{where}class is {shown(found.object_class)}, expected one word such as 'Car'"
+        raise DataFormatError(path, problem, cure="write names of classes without spaces")
     missing = [key for key in _BOX_KEYS if getattr(found, key) is None]
     if 0 < len(missing) < len(_BOX_KEYS):
-        raise DataFormatError(path, f"{where.rstrip('.')}: a 3D box needs {', '.join(missing)} too")
+        problem = f"{where.rstrip('.')}: a 3D box needs {', '.join(missing)} too"
+        raise DataFormatError(path, problem, cure=f"give {', '.join(_BOX_KEYS)}, or none of them")
     if found.dimensions_hwl_m is not None and min(found.dimensions_hwl_m) <= 0:
-        raise DataFormatError(path, f"{where}dimensions_hwl_m: expected lengths above 0, got {found.dimensions_hwl_m}")
+        problem = f"{where}dimensions_hwl_m: expected lengths above 0, got {found.dimensions_hwl_m}"
+        raise DataFormatError(path, problem, cure="give [height, width, length] in metres, or leave the 3D box out")
     if abs(found.track_id) >= 2**31:
         raise DataFormatError(path, f"{where}track_id: expected 32 bits, got {found.track_id}", cure="-1 for none")
     return found
@@ -133,7 +136,8 @@ def _read(path: Path) -> dict[str, Any]:
         raise DataFormatError(path, "is not a JSON object", cure=_CURE)
     version = content.pop("schema_version", None)
     if version != FOLDER_SCHEMA_VERSION:
-        raise DataFormatError(path, f"'schema_version' is {shown(version)}, expected {FOLDER_SCHEMA_VERSION}")
+        problem = f"'schema_version' is {shown(version)}, expected {FOLDER_SCHEMA_VERSION}"
+        raise DataFormatError(path, problem, cure=_CURE)
     return content
 
 

@@ -97,6 +97,10 @@ def _words_of_folder() -> Words:
     says = {
         **_of_boxes(_FOLDER_FORM),
         "box_units": _UNITS_IN_FILES,
+        "box_origin": Says(
+            "bottom_center_m, the centre of the box's bottom face",
+            "give bottom_center_m, half a height below the centre of the box (y points down, so it is larger there)",
+        ),
         "box_order": Says("height, width, length", "give dimensions_hwl_m as [height, width, length]"),
         "baseline_sign": Says(
             "baseline_m above 0, or t_right_cam_m with a first component below 0",

@@ -7,6 +7,7 @@ import os
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -20,14 +21,15 @@ from directshape_torch.data_check import check_dataset as module
 from directshape_torch.data_check.check_dataset import check_dataset
 from directshape_torch.data_check.check_frame import numbers_of
 from directshape_torch.errors import InputError
+from directshape_torch.geometry.box_formats import BoxFormat
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_calibration import KittiCalibration
 from directshape_torch.io.stereo_dataset import LayoutName, open_dataset
 from directshape_torch.scene_check.check_images import PairMatches, check_calibration, check_pair
 from directshape_torch.scene_check.check_places import check_distances
-from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, unreadable
-from directshape_torch.scene_check.words import KITTI_FILES
+from directshape_torch.scene_check.finding import MISTAKES, CheckReport, Finding, by_severity, found, unreadable
+from directshape_torch.scene_check.words import KITTI_FILES, words_of_files, words_of_tensors
 
 SIZE_HW = (400, 1200)
 K = np.array([[700.0, 0, 600], [0, 700, 200], [0, 0, 1]])
@@ -221,6 +223,25 @@ def test_a_plain_folder_is_spoken_of_by_its_own_keys(
     report = check_dataset(open_dataset("folder", tmp_path))
     assert any(each.check == check and words in each.cure for each in report.findings), report
     assert not any(word in str(report) for word in ("P2", "P3", "rotation_y "))
+
+
+def test_every_kind_of_mistake_has_words_in_every_source() -> None:
+    """A finding is made without a word missing, of any convention and of any layout."""
+    sources = [
+        *map(words_of_tensors, get_args(BoxFormat)),
+        words_of_files(Path("calib.txt"), ("P_rect_02", "P_rect_03")),
+        words_of_files(Path("rig.json")),
+    ]
+    needed = {check for check, kind in MISTAKES.items() if not kind.expected}
+    for words in sources:
+        # Tensors have positive baselines, or none are made; and cars, or nothing is looked at.
+        made = needed - ({"baseline_sign", "no_cars"} if not words.calibration_file else set())
+        for check in made:
+            finding = found(check, "here", "this", words=words, low=0, high=1, limit=0.5)
+            assert all((finding.expected, finding.cure))
+    raw = found("baseline_sign", "here", "this", words=sources[-2])
+    assert raw.cure.startswith("swap P_rect_02 and P_rect_03")
+    assert "bottom_center_m" in found("box_origin", "here", "this", words=sources[-1]).cure
 
 
 def test_report_in_words() -> None:
