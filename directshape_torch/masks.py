@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Self, Union
 
 import numpy as np
 import torch
@@ -19,8 +19,8 @@ from directshape_torch.numerics.records import Dense, TensorRecord
 MASK_THRESHOLD = 0.5
 """Foreground probability above which an instance covers a pixel."""
 
-Masks = Tensor | NDArray[Any] | Sequence[Tensor | NDArray[Any] | None]
-"""Masks of B instances as users have them: (B, H, W), or B entries that are (H, W) or None."""
+Masks = Union[Tensor, NDArray[Any], Sequence[Tensor | NDArray[Any] | None], "MaskCrops"]
+"""Masks of B instances as users have them: (B, H, W), B entries that are (H, W) or None, or crops."""
 
 # Resampling by cubic kernels overshoots by a quarter at an edge; logits and 0..255 go far beyond.
 _HIGHEST_PROBABILITY = 1.5
@@ -63,14 +63,17 @@ class MaskCrops(TensorRecord):
         """Crops of masks as users have them.
 
         Args:
-            masks: (B, H, W) or B entries that are (H, W) or None, tensors or numpy arrays: bool, uint8 (0 and 1, or
-                0..255), or foreground probability. Masks that require gradients are kept whole, for zeros have one too.
+            masks: (B, H, W) or B entries that are (H, W) or None, tensors or numpy arrays, or crops: bool, uint8 (0 and
+                1, or 0..255), or foreground probability. Masks that require gradients are kept whole, for zeros have
+                one too.
             present: (B,) bool, masks that are there; the others are not read. None: all of them are there.
             name: of the argument, for errors.
 
         Raises:
             InputError: no masks of one size, another dtype, or values above 1.5.
         """
+        if isinstance(masks, cls):
+            return masks if present is None else masks.where(present)
         masks = _as_tensor(masks)
         entries = _entries(name, masks)
         exists = [True] * len(entries)

@@ -359,9 +359,7 @@ def _as_images(name: str, images: Tensor, like: Tensor) -> Tensor:
 def _cut_masks(instances: Detections | Occluders) -> None:
     """Crops in place of the masks of a record that came in another form."""
     for name in ("mask_left", "mask_right"):
-        masks = getattr(instances, name)
-        if not isinstance(masks, MaskCrops):
-            object.__setattr__(instances, name, MaskCrops.of(masks, name=name))
+        object.__setattr__(instances, name, MaskCrops.of(getattr(instances, name), name=name))
 
 
 def _check_mask_numbers(left: MaskCrops, right: MaskCrops, count: int) -> None:

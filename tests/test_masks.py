@@ -112,6 +112,8 @@ def test_rows_where_joined_padded_and_moved() -> None:
     assert padded.dense().equal(torch.nn.functional.pad(masks, (0, 9, 0, 7)))
     assert crops.to(torch.float64).values.dtype == torch.float64
     assert MaskCrops.of(masks > 0.5).to(torch.float64).values.dtype == torch.bool
+    assert MaskCrops.of(crops) is crops
+    assert MaskCrops.of(crops, present).dense().equal(masks * present[:, None, None])
     assert MaskCrops.none(3, (4, 6), masks).dense().equal(torch.zeros(3, 4, 6))
     with pytest.raises(InputError, match=r"records: expected masks of images of one size, .*; pad them"):
         MaskCrops.joined([crops, padded])

@@ -197,7 +197,9 @@ def object_layout(root: Path | str, detections_dir: Path | str) -> Layout:
     """KITTI's object benchmark: `root/training`, else `root/testing`, else `root` itself with image_2, image_3, calib,
     label_2, planes; detections apart.
     """
-    base = _split_with(Path(root), "image_2")
+    training = Path(root) / "training"
+    # What a training folder lacks is said of its files.
+    base = _split_with(Path(root), "image_2") or (training if training.is_dir() else None)
     if base is None:
         problem = "holds no image_2, training/image_2 or testing/image_2 in KITTI's layout"
         raise DataFormatError(root, problem, cure="check the path or --layout")
