@@ -18,7 +18,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.gradient_mode import is_within_transform
 from directshape_torch.observation.packing import Observation, pack_pixels
-from directshape_torch.observation.refinable import check_fit, check_no_tangents, refusals
+from directshape_torch.observation.refinable import check_fit, check_no_tangents, in_dtype_of, refusals
 from directshape_torch.refinement.outcome import as_they_came
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.result import RefinementResult
@@ -100,7 +100,7 @@ class DirectShapeRefiner(nn.Module):
 
         Args:
             frames: F frames; dtype and device must be those of the prior.
-            detections: B cars in any order.
+            detections: B cars in any order; their dtype follows that of the frames.
             term_weights: (B,) factors of named terms for each car, beside the weights of the configuration: how far a
                 network trusts each of them.
 
@@ -130,7 +130,7 @@ class DirectShapeRefiner(nn.Module):
         differentiate = self.config.backward.mode != "none" and torch.is_grad_enabled()
         with (
             torch.set_grad_enabled(differentiate),
-            full_precision(frames.images_left.device.type),
+            full_precision(),
             compiling(self.config.compile, len(detections)),
         ):
             return self._refine(frames, detections, term_weights)
@@ -180,6 +180,7 @@ class DirectShapeRefiner(nn.Module):
         found = self._minimise(problem, initial, cars, came.rows(rows))
         return replace(came.put(rows, found), term_names=found.term_names, has_shape=found.has_shape)
 
+    @full_precision()
     def problem(
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None = None
     ) -> tuple[CarProblem, CarState]:
@@ -194,6 +195,7 @@ class DirectShapeRefiner(nn.Module):
 
     def _with_rig(self, frames: FrameBatch, detections: Detections) -> tuple[FrameBatch, Detections]:
         """The call's inputs, checked, with what is known of the rig and the detector."""
+        detections = in_dtype_of(frames, detections)
         frames = frames if self.rig is None else self.rig.corrected(frames)
         check_fit(frames, detections, self.prior)
         if self.rig is None:

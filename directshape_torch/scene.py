@@ -30,6 +30,7 @@ from directshape_torch.numerics.checks import (
     check_words,
     is_no_rotation,
 )
+from directshape_torch.numerics.conversion import Given, as_floating, as_index, as_tensor, working_dtype
 from directshape_torch.numerics.records import Dense, TensorRecord
 
 Side = Literal["left", "right"]
@@ -101,15 +102,18 @@ class FrameBatch(TensorRecord):
     @classmethod
     def from_images(
         cls,
-        images_left: Tensor,  # (F, 3, H, W), or (3, H, W) of one frame
-        images_right: Tensor,
+        images_left: Given,  # (F, 3, H, W), or (3, H, W) of one frame
+        images_right: Given,
         camera: StereoCamera,
         ground: GroundPlane | float = 1.65,
         frame_ids: Sequence[str] | None = None,
-        time_s: Tensor | None = None,
-        T_world_cam: Tensor | None = None,
+        time_s: Given | None = None,
+        T_world_cam: Given | None = None,
     ) -> FrameBatch:
         """Frames without padding, of RGB images in floating point in [0, 1] or uint8.
+
+        All follow the left images, camera, ground, times and poses too, to their device and their dtype: float32 or
+        float64; bytes and half precision become float32. Arrays and lists are taken for tensors.
 
         Args:
             images_left, images_right: rectified pairs.
@@ -128,18 +132,19 @@ class FrameBatch(TensorRecord):
             >>> frames.sizes, frames.frame_ids
             (tensor([[120, 400]]), ('000000',))
         """
-        left, right = (
-            _as_images(name, images, camera.K_left)
-            for name, images in (("images_left", images_left), ("images_right", images_right))
-        )
-        count, like = len(left), camera.K_left
+        check_type("camera", camera, (StereoCamera,))
+        left, right = _as_images("images_left", images_left), _as_images("images_right", images_right)
+        count = len(left)
         if camera.num_frames == 1:
             camera = camera.rows(torch.zeros(count, dtype=torch.long))
         if not isinstance(ground, GroundPlane):
-            ground = GroundPlane.from_camera_height(ground, count).to(like.device, like.dtype)
+            ground = GroundPlane.from_camera_height(ground, count)
+        camera, ground = camera.to(left.device, left.dtype), ground.to(left.device, left.dtype)
+        time_s, T_world_cam = (as_floating(values, left) for values in (time_s, T_world_cam))
         sizes = torch.tensor([left.shape[2:]] * count, device=left.device).reshape(count, 2)
         names = tuple(f"{number:06d}" for number in range(count)) if frame_ids is None else frame_ids
         check_type("frame_ids", names, (tuple, list))
+        right = right if right.dtype == left.dtype else right.to(left.dtype)
         return cls(left, right, sizes, camera, ground, tuple(names), time_s=time_s, T_world_cam=T_world_cam)
 
     def __len__(self) -> int:
@@ -247,22 +252,25 @@ class Detections(TensorRecord):
     @classmethod
     def from_boxes(
         cls,
-        boxes: Tensor,  # (B, 7) or (B, 8, 3)
+        boxes: Given,  # (B, 7) or (B, 8, 3)
         convention: BoxFormat = "kitti",
         *,
         mask_left: Masks | None = None,
         mask_right: Masks | None = None,
-        has_mask_left: Tensor | None = None,
-        has_mask_right: Tensor | None = None,
-        frame_index: Tensor | None = None,
-        score: Tensor | None = None,
-        box_2d: Tensor | None = None,
-        T_cam_boxes: Tensor | None = None,
+        has_mask_left: Given | None = None,
+        has_mask_right: Given | None = None,
+        frame_index: Given | None = None,
+        score: Given | None = None,
+        box_2d: Given | None = None,
+        T_cam_boxes: Given | None = None,
         occluders: Occluders | None = None,
-        pose_sigma: Tensor | None = None,
-        track_id: Tensor | None = None,
+        pose_sigma: Given | None = None,
+        track_id: Given | None = None,
     ) -> Detections:
         """Detections of boxes as a detector writes them, and of the masks that there are.
+
+        All numbers but the masks follow the boxes, to float32 or float64; half precision becomes float32. A refiner
+        then takes them to the dtype of the frames. Arrays and lists are taken for tensors.
 
         Args:
             boxes: x, y, z, three sizes and heading, or corners, in metres and radians; what they mean, and in which
@@ -295,8 +303,9 @@ class Detections(TensorRecord):
         """
         T_cam_obj, dimensions_hwl = boxes_to_poses(boxes, convention, T_cam_boxes)
         if T_cam_boxes is not None:
+            T_cam_boxes = as_floating(T_cam_boxes)
             check_upright(T_cam_boxes, convention)
-        count = len(boxes)
+        like, count = T_cam_obj, len(T_cam_obj)
         if mask_left is None:
             cure = "give mask_left; a car without a left mask is not refined"
             raise InputError("mask_left", f"masks of {count} cars in the left image", "None", cure)
@@ -308,18 +317,16 @@ class Detections(TensorRecord):
         )
         _check_mask_numbers(left, right, count)
         return cls(
-            frame_index=torch.zeros(count, dtype=torch.long, device=boxes.device)
-            if frame_index is None
-            else frame_index,
+            frame_index=as_index([0] * count if frame_index is None else frame_index, like),
             T_cam_obj=T_cam_obj,
             dimensions_hwl=dimensions_hwl,
-            box_2d=left.box_2d.to(boxes) if box_2d is None else box_2d,
-            score=boxes.new_ones(count) if score is None else score,
+            box_2d=as_floating(left.box_2d if box_2d is None else box_2d, like),
+            score=as_floating([1] * count if score is None else score, like),
             mask_left=left,
             mask_right=right,
             occluders=occluders,
-            pose_sigma=pose_sigma,
-            track_id=track_id,
+            pose_sigma=as_floating(pose_sigma, like),
+            track_id=as_index(track_id, like),
             convention=convention,
         )
 
@@ -347,13 +354,14 @@ class Detections(TensorRecord):
         return len(self.frame_index)
 
 
-def _as_images(name: str, images: Tensor, like: Tensor) -> Tensor:
-    """RGB (F, 3, H, W) in [0, 1], of the dtype of `like` where they were bytes."""
+def _as_images(name: str, images: Given) -> Tensor:
+    """RGB (F, 3, H, W) in [0, 1], in float32 or float64."""
+    images = as_tensor(images)
     shape = (3, "H", "W") if isinstance(images, Tensor) and images.ndim == 3 else ("F", 3, "H", "W")
     is_bytes = isinstance(images, Tensor) and images.dtype == torch.uint8
     check_shape(name, images, shape, "colours come first: image.permute(2, 0, 1)", "number" if is_bytes else "image")
     images = images if images.ndim == 4 else images[None]
-    return images.to(like.dtype) / 255 if is_bytes else images
+    return images.float() / 255 if is_bytes else images.to(working_dtype(images.dtype))
 
 
 def _cut_masks(instances: Detections | Occluders) -> None:

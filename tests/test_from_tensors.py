@@ -66,7 +66,7 @@ def test_intrinsics_of_one_and_of_many_frames() -> None:
     with pytest.raises(InputError, match=r"baseline_m: expected shape \(1,\)"):
         StereoCamera.from_intrinsics(K, torch.tensor([0.5, 0.6]))
     with pytest.raises(InputError, match="K: expected floating point"):
-        StereoCamera.from_intrinsics(K.long(), 0.5)
+        StereoCamera.from_intrinsics(K.bool(), 0.5)
 
 
 def test_projections_of_one_frame_and_their_mistakes() -> None:

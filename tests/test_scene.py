@@ -194,13 +194,12 @@ def test_projections_can_be_inverted(side: str) -> None:
 _SHIFTS = (("left", 0.0), ("right", -0.5))
 
 
-def test_projections_share_a_dtype() -> None:
-    P_left, P_right = (torch.eye(3, 4)[None] for _ in _SHIFTS)
-    with pytest.raises(InputError, match=r"P_right: expected the dtype of P_left \(torch.float32\), got torch.float64"):
-        StereoCamera.from_projections(P_left, P_right.double())
-    for wrong in (torch.int64, torch.float16):
-        with pytest.raises(InputError, match=rf"P_left: expected float32 or float64, got {wrong}; convert it"):
-            StereoCamera.from_projections(P_left.to(wrong), P_right)
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.int64])
+def test_projections_have_the_dtype_of_the_left_one(dtype: torch.dtype) -> None:
+    P = {name: torch.tensor([[[64, 0, 8, 64 * x], [0, 64, 4, 0], [0, 0, 1, 0]]]) for name, x in _SHIFTS}
+    camera = StereoCamera.from_projections(P["left"].to(dtype), P["right"].double())
+    assert camera.K_left.dtype == camera.T_right_cam.dtype == (dtype if dtype == torch.float64 else torch.float32)
+    torch.testing.assert_close(camera.T_right_cam[0, :3, 3].double(), torch.tensor([-0.5, 0, 0], dtype=torch.float64))
 
 
 def pinhole(

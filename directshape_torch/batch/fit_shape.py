@@ -16,6 +16,8 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses, is_z_up
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.numerics.checks import check_shape
+from directshape_torch.numerics.conversion import Given, as_floating
+from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.refinement.quality import EVIDENCE_NAMES
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
@@ -65,9 +67,10 @@ class ShapeFit:
         return {**arrays, **more, "statuses": np.array([each.name for each in self.cars.status], dtype=np.str_)}
 
 
+@full_precision()
 def fit_shape(
-    points: Tensor,  # (P, 3) metres
-    boxes: Tensor,  # (N, 7) or (N, 8, 3)
+    points: Given,  # (P, 3) metres
+    boxes: Given,  # (N, 7) or (N, 8, 3)
     convention: BoxFormat = "mmdet3d_lidar",
     prior: ShapePrior | None = None,
 ) -> ShapeFit:
@@ -89,6 +92,7 @@ def fit_shape(
         >>> fit.cars.status[0].is_refined, fit.num_points
         (True, tensor([200]))
     """
+    points, boxes = as_floating(points), as_floating(boxes)
     check_shape("points", points, ("P", 3), kind="floating")
     T_points_obj, hwl = boxes_to_poses(boxes, convention, torch.eye(4))  # their frame stands for the camera
     points = points.to(boxes)
@@ -142,7 +146,7 @@ def _points_of_boxes(
 ) -> tuple[PointSamples, Tensor]:
     """The points in each box, in the frames (N, 4, 4) of the cameras of the cars."""
     T_cam_points = T_cam_obj @ se3.inverse(T_points_obj)
-    height, width, length = (hwl + torch.tensor([_BEYOND_BOX_M, 2 * _BEYOND_BOX_M, 2 * _BEYOND_BOX_M]).to(hwl)).T
+    height, width, length = (hwl + hwl.new_tensor([_BEYOND_BOX_M, 2 * _BEYOND_BOX_M, 2 * _BEYOND_BOX_M])).T
     car, chosen, counts = [], [], []
     for number in range(len(hwl)):
         x, y, z = se3.transform(se3.inverse(T_points_obj[number]), points).T

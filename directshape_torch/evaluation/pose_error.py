@@ -13,6 +13,7 @@ from directshape_torch.evaluation.rotated_iou import bev_boxes, bev_iou, iou_3d
 from directshape_torch.geometry.box3d import wrap_angle
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.numerics.checks import check_shape
+from directshape_torch.numerics.full_precision import in_full_precision
 
 Number = TypeVar("Number", Tensor, float)
 
@@ -51,6 +52,7 @@ def boxes_of(objects: Sequence[KittiObject]) -> Tensor:
     return torch.tensor(rows, dtype=torch.float64).reshape(-1, 7)
 
 
+@in_full_precision
 def pose_errors(
     boxes: Tensor,  # (N, 7)
     true_boxes: Tensor,  # (N, 7)

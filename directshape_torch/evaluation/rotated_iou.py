@@ -12,11 +12,13 @@ import torch
 from torch import Tensor
 
 from directshape_torch.numerics.checks import check_shape
+from directshape_torch.numerics.full_precision import in_full_precision
 
 _BEV_LAYOUT = "columns are x, z, length, width, rotation_y"
 _BOX_LAYOUT = "columns are x, y, z (bottom centre), height, width, length, rotation_y"
 
 
+@in_full_precision
 def bev_boxes(boxes: Tensor) -> Tensor:
     """Footprints (*, 5) x, z, length, width, rotation_y of KITTI boxes (*, 7) x, y, z, height, width, length, yaw.
 
@@ -27,6 +29,7 @@ def bev_boxes(boxes: Tensor) -> Tensor:
     return boxes[..., [0, 2, 5, 4, 6]]
 
 
+@in_full_precision
 def bev_iou(
     boxes_a: Tensor,  # (N, 5)
     boxes_b: Tensor,  # (N, 5)
@@ -49,6 +52,7 @@ def bev_iou(
     return _ratio(_intersection_area(boxes_a, boxes_b), _area(boxes_a), _area(boxes_b))
 
 
+@in_full_precision
 def iou_3d(
     boxes_a: Tensor,  # (N, 7)
     boxes_b: Tensor,  # (N, 7)

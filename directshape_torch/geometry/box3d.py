@@ -12,8 +12,10 @@ import torch
 from torch import Tensor
 
 from directshape_torch.geometry.se3 import from_rotation_translation, transform
+from directshape_torch.numerics.full_precision import in_full_precision
 
 
+@in_full_precision
 def rotation_about_y(angle: Tensor) -> Tensor:
     """Rotation matrices (*, 3, 3) by angles (*,) in radians about the y axis, in KITTI's sense."""
     c, s = torch.cos(angle), torch.sin(angle)
@@ -22,6 +24,7 @@ def rotation_about_y(angle: Tensor) -> Tensor:
     return rows.reshape(*angle.shape, 3, 3)
 
 
+@in_full_precision
 def pose_from_kitti(
     location: Tensor,  # (*, 3) bottom centre of the box, metres
     rotation_y: Tensor,  # (*,) radians
@@ -30,16 +33,19 @@ def pose_from_kitti(
     return from_rotation_translation(rotation_about_y(rotation_y), location)
 
 
+@in_full_precision
 def rotation_y_from_pose(T: Tensor) -> Tensor:
     """KITTI's heading (*,) of poses (*, 4, 4): `atan2(-R[2, 0], R[0, 0])`, the direction of the car's x axis."""
     return torch.atan2(-T[..., 2, 0], T[..., 0, 0])
 
 
+@in_full_precision
 def wrap_angle(angle: Tensor) -> Tensor:
     """Angles brought into [-pi, pi)."""
     return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
 
 
+@in_full_precision
 def alpha_from_kitti(
     location_ref: Tensor,  # (*, 3)
     rotation_y: Tensor,  # (*,)
@@ -48,6 +54,7 @@ def alpha_from_kitti(
     return wrap_angle(rotation_y - torch.atan2(location_ref[..., 0], location_ref[..., 2]))
 
 
+@in_full_precision
 def viewing_axes(origin_cam: Tensor) -> Tensor:
     """Unit vectors (B, 3, 3), rows: along the viewing ray of points (B, 3) with y left out, across it, and down."""
     x, z = origin_cam[:, 0], origin_cam[:, 2]
@@ -57,6 +64,7 @@ def viewing_axes(origin_cam: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).view(-1, 3, 3)
 
 
+@in_full_precision
 def box_corners(
     T_a_obj: Tensor,  # (*, 4, 4)
     dimensions_hwl: Tensor,  # (*, 3) height, width, length, metres

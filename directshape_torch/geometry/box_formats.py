@@ -29,6 +29,8 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import rotation_about_y
 from directshape_torch.numerics.checks import check_rotation, check_rows, check_shape
+from directshape_torch.numerics.conversion import Given, as_floating
+from directshape_torch.numerics.full_precision import in_full_precision
 
 BoxFormat = Literal["kitti", "mmdet3d_camera", "mmdet3d_lidar", "openpcdet", "nuscenes", "opencv"]
 # Corners that were rounded to centimetres still make a box, those in another order do not.
@@ -95,12 +97,16 @@ _FORMS: dict[str, BoxForm] = {
 }
 
 
+@in_full_precision
 def boxes_to_poses(
-    boxes: Tensor,  # (N, 7) x, y, z, three sizes, heading; or (N, 8, 3) corners; metres and radians
+    boxes: Given,  # (N, 7) x, y, z, three sizes, heading; or (N, 8, 3) corners; metres and radians
     convention: BoxFormat,
-    T_cam_boxes: Tensor | None = None,  # (4, 4) or (N, 4, 4), from the frame of the boxes to the left camera
+    T_cam_boxes: Given | None = None,  # (4, 4) or (N, 4, 4), from the frame of the boxes to the left camera
 ) -> tuple[Tensor, Tensor]:
     """`T_cam_obj` (N, 4, 4) and heights, widths and lengths (N, 3) of boxes in one of the formats above.
+
+    Boxes may be an array or a list. The poses are float64 where the boxes are, else float32, which half precision
+    becomes too: a box from a network in bfloat16 at 20 m is known to 6 cm, but is not rounded again.
 
     Raises:
         InputError: an unknown convention, another shape, a frame with z up without `T_cam_boxes`, or corners that
@@ -111,7 +117,7 @@ def boxes_to_poses(
         >>> hwl
         tensor([[1.5000, 1.6000, 4.0000]])
     """
-    form = box_form(convention)
+    form, boxes = box_form(convention), as_floating(boxes)
     if not isinstance(boxes, Tensor) or boxes.ndim != 3:
         check_shape("boxes", boxes, ("N", 7), _cure_of_shape(boxes, convention), "floating")
         T_boxes_obj, hwl = _from_numbers(boxes, form)
@@ -122,11 +128,12 @@ def boxes_to_poses(
     return (T_boxes_obj if T is None else T @ T_boxes_obj), hwl
 
 
+@in_full_precision
 def poses_to_boxes(
     T_cam_obj: Tensor,  # (N, 4, 4), origin under the middle of the box
     dimensions_hwl: Tensor,  # (N, 3) metres
     convention: BoxFormat,
-    T_cam_boxes: Tensor | None = None,  # (4, 4) or (N, 4, 4), from the frame of the boxes to the left camera
+    T_cam_boxes: Given | None = None,  # (4, 4) or (N, 4, 4), from the frame of the boxes to the left camera
 ) -> Tensor:
     """Boxes (N, 7) in one of the formats above; of the rotation only the heading is left.
 
@@ -187,7 +194,7 @@ def _cure_of_shape(boxes: object, convention: str) -> str:
     return order
 
 
-def _to_camera(T_cam_boxes: Tensor | None, convention: str, like: Tensor) -> Tensor | None:
+def _to_camera(T_cam_boxes: Given | None, convention: str, like: Tensor) -> Tensor | None:
     if T_cam_boxes is None:
         if not _FORMS[convention].upright:
             return None
@@ -199,6 +206,7 @@ def _to_camera(T_cam_boxes: Tensor | None, convention: str, like: Tensor) -> Ten
             "None",
             nuscenes if convention == "nuscenes" else kitti,
         )
+    T_cam_boxes = as_floating(T_cam_boxes)
     shape = (4, 4) if isinstance(T_cam_boxes, Tensor) and T_cam_boxes.ndim == 2 else (len(like), 4, 4)
     check_shape("T_cam_boxes", T_cam_boxes, shape, "give one motion, or one for each box", "floating")
     check_rotation("T_cam_boxes", T_cam_boxes.reshape(-1, 4, 4))

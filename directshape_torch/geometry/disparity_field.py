@@ -16,6 +16,7 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import check_finite, check_shape, check_size_wh
+from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.numerics.gradient_mode import is_plain
 
 # Exponents of the normalised (u, v) in each basis function: 1, u, v, u^2, uv, v^2, u^3, u^2 v, u v^2, u^4.
@@ -31,6 +32,7 @@ _TOLERANCE_M = 1e-3
 _TOLERANCE_ROTATION = 1e-4
 
 
+@in_full_precision
 def polynomial_basis(
     uv: Tensor,  # (*, 2) pixels of the left image
     size_wh: tuple[int, int],
@@ -42,6 +44,7 @@ def polynomial_basis(
     return torch.stack([u_powers[i] * v_powers[j] for i, j in EXPONENTS], dim=-1)
 
 
+@in_full_precision
 def nearest_in_convex_polygon(
     points: Tensor,  # (*, 2)
     polygon: Tensor,  # (M, 2) vertices in order, either sense
@@ -113,6 +116,7 @@ class DisparityField:
             raise InputError("hull_uv", "shape (M, 2) with at least 3 vertices", f"{tuple(self.hull_uv.shape)}")
 
     @classmethod
+    @in_full_precision
     def constant(
         cls,
         value_px: float,
@@ -147,6 +151,7 @@ class DisparityField:
         """Measured minus true disparity, pixels, in the dtype of `uv_left`; beyond the hull that of its border."""
         return self.offsets(uv_left)[0]
 
+    @in_full_precision
     def offsets(
         self,
         uv_left: Tensor,  # (*, 2) pixels of the full-resolution left image
@@ -160,6 +165,7 @@ class DisparityField:
         bias, vertical = (polynomial_basis(inside, self.size_wh) @ coefficients).unbind(dim=-1)
         return bias, vertical
 
+    @in_full_precision
     def sigma(
         self,
         uv_left: Tensor,  # (*, 2) pixels of the full-resolution left image

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.numerics.checks import check_positive, check_rows, check_words
+from directshape_torch.numerics.conversion import as_number, working_dtype
 from directshape_torch.numerics.records import Dense, TensorRecord
 
 
@@ -41,6 +42,9 @@ class GroundPlane(TensorRecord):
     def from_camera_height(cls, height_m: float, num_frames: int = 1) -> GroundPlane:
         """A level ground `height_m` below the camera, for rigs without plane files.
 
+        The plane is float32, or float64 where that is PyTorch's default; `FrameBatch.from_images` takes it to the
+        dtype of its images.
+
         Raises:
             InputError: a height that is not above 0, or infinite.
 
@@ -48,6 +52,9 @@ class GroundPlane(TensorRecord):
             >>> GroundPlane.from_camera_height(1.65).offset
             tensor([1.6500])
         """
+        height_m = as_number(height_m)
         check_positive("height_m", height_m, "give the camera's height above the road, in metres")
-        normal = torch.tensor([[0.0, -1.0, 0.0]]).repeat(num_frames, 1)
-        return cls(normal, torch.full((num_frames,), float(height_m)), ("camera_height",) * num_frames)
+        dtype = working_dtype(torch.get_default_dtype())
+        normal = torch.tensor([[0.0, -1.0, 0.0]], dtype=dtype).repeat(num_frames, 1)
+        offset = torch.full((num_frames,), float(height_m), dtype=dtype)
+        return cls(normal, offset, ("camera_height",) * num_frames)

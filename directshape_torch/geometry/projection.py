@@ -12,8 +12,10 @@ import torch
 from torch import Tensor
 
 from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.numerics.full_precision import in_full_precision
 
 
+@in_full_precision
 def rays_from_pixels(
     uv: Tensor,  # (*, 2) pixels
     K: Tensor,  # (*, 3, 3)
@@ -30,6 +32,7 @@ def rays_from_pixels(
     return torch.stack([u, v, torch.ones_like(u)], dim=-1)
 
 
+@in_full_precision
 def project(
     points_cam: Tensor,  # (*, 3) metres
     K: Tensor,  # (*, 3, 3)
@@ -53,6 +56,7 @@ class RightPixels(NamedTuple):
     in_front: Tensor  # (*,) bool, false where the point is behind the right camera
 
 
+@in_full_precision
 def warp_to_right(
     ray_left: Tensor,  # (*, 3) K_left^-1 [u, v, 1]
     depth: Tensor,  # (*,) depth along the optical axis of the left camera, metres
@@ -92,6 +96,7 @@ class RightRays(NamedTuple):
     direction_cam: Tensor  # (*, 3) unit depth in the right camera
 
 
+@in_full_precision
 def right_rays(
     uv_right: Tensor,  # (*, 2) pixels of the right image
     K_right: Tensor,  # (*, 3, 3)
@@ -120,6 +125,7 @@ def right_rays(
     return RightRays(origin.expand_as(direction), direction)
 
 
+@in_full_precision
 def disparity_of_depth(
     uv_left: Tensor,  # (*, 2) pixels
     depth: Tensor,  # (*,) metres
@@ -141,6 +147,7 @@ def disparity_of_depth(
     return uv_left - homogeneous[..., :2] / homogeneous[..., 2:]
 
 
+@in_full_precision
 def depth_from_disparity(
     uv_left: Tensor,  # (*, 2) pixels
     disparity: Tensor,  # (*,) u_left - u_right, pixels
@@ -172,6 +179,7 @@ def depth_from_disparity(
     return torch.where(depth.isfinite() & (depth > 0), depth, torch.full_like(depth, torch.nan))
 
 
+@in_full_precision
 def points_from_disparity(
     uv_left: Tensor,  # (*, 2) pixels
     disparity: Tensor,  # (*,) pixels

@@ -16,6 +16,7 @@ from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
 from directshape_torch.errors import InputError
+from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.numerics.tensors import made_once
 
 # Below this squared angle trigonometric ratios are replaced by Taylor series, whose first terms left out are then
@@ -62,6 +63,7 @@ def _higher_exp_coefficients(angle_squared: Tensor, max_angle: float) -> Tensor:
     return torch.where(angle_squared < _SERIES_ANGLE_SQUARED, series, ratios)
 
 
+@in_full_precision
 def exp(twist: Tensor, max_angle: float = math.inf) -> Tensor:
     """Exponential map of SE(3).
 
@@ -88,6 +90,7 @@ def exp(twist: Tensor, max_angle: float = math.inf) -> Tensor:
     return T.view(*twist.shape[:-1], 4, 4)
 
 
+@in_full_precision
 def from_rotation_translation(R: Tensor, t: Tensor) -> Tensor:
     """Homogeneous transforms :math:`(*, 4, 4)` from rotations :math:`(*, 3, 3)` and translations :math:`(*, 3)`.
 
@@ -100,6 +103,7 @@ def from_rotation_translation(R: Tensor, t: Tensor) -> Tensor:
     return torch.cat([top, bottom], dim=-2)
 
 
+@in_full_precision
 def inverse(T: Tensor) -> Tensor:
     """Inverse of rigid transforms :math:`(*, 4, 4)`, by transposition of the rotation.
 
@@ -112,6 +116,7 @@ def inverse(T: Tensor) -> Tensor:
     return from_rotation_translation(R_transposed, -(R_transposed @ T[..., :3, 3:])[..., 0])
 
 
+@in_full_precision
 def transform(T_b_a: Tensor, points_a: Tensor) -> Tensor:
     """Points :math:`(*, 3)` in frame a moved to frame b by :math:`(*, 4, 4)`; leading dimensions broadcast.
 
@@ -140,6 +145,7 @@ def from_kornia(motion: Se3) -> Tensor:
     return motion.matrix()
 
 
+@in_full_precision
 def to_kornia(T: Tensor) -> Se3:
     """Rigid transforms :math:`(*, 4, 4)` as kornia's `Se3`, say of `RefinementResult.T_cam_obj`.
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from types import NoneType
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,6 +22,8 @@ from directshape_torch.numerics.checks import (
     check_shape,
     check_type,
 )
+from directshape_torch.numerics.conversion import Given, as_floating
+from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.numerics.records import Dense, TensorRecord
 
 if TYPE_CHECKING:
@@ -68,12 +71,15 @@ class StereoCamera(TensorRecord):
     @classmethod
     def from_intrinsics(
         cls,
-        K: Tensor,  # (3, 3) or (F, 3, 3)
-        baseline_m: float | Tensor,  # or (F,)
-        K_right: Tensor | None = None,
+        K: Given,  # (3, 3) or (F, 3, 3)
+        baseline_m: float | Given,  # or (F,)
+        K_right: Given | None = None,
         disparity_field: DisparityField | None = None,
     ) -> StereoCamera:
         """An ideal rectified pair: parallel cameras side by side, and labels in the frame of the left one.
+
+        The camera is float64 where K is, as arrays are, else float32; `FrameBatch.from_images` takes it to the dtype of
+        its images.
 
         Args:
             K: intrinsics of the images, pixels; one matrix for one frame, or one for each of F frames.
@@ -95,8 +101,9 @@ class StereoCamera(TensorRecord):
         if len(of_right) not in (1, len(K_left)):
             expected, cure = f"one matrix, or {len(K_left)} as K has", "give one K_right for all frames or one for each"
             raise InputError("K_right", expected, f"{len(of_right)}", cure)
-        if isinstance(baseline_m, Tensor):
-            check_shape("baseline_m", baseline_m, (len(K_left),) if baseline_m.ndim else ())
+        if isinstance(baseline_m, (Tensor, np.ndarray)):
+            baseline_m = as_floating(baseline_m, K_left)
+            check_shape("baseline_m", baseline_m, (len(K_left),) if baseline_m.ndim else (), kind="floating")
         else:
             cure = "give the distance of the cameras in metres; of projections it is -P_right[0, 3] / P_right[0, 0]"
             check_positive("baseline_m", baseline_m, cure)
@@ -108,8 +115,8 @@ class StereoCamera(TensorRecord):
     @classmethod
     def from_projections(
         cls,
-        P_left: Tensor,  # (3, 4) or (F, 3, 4)
-        P_right: Tensor,  # of the same shape
+        P_left: Given,  # (3, 4) or (F, 3, 4)
+        P_right: Given,  # of the same shape
         disparity_field: DisparityField | None = None,
     ) -> StereoCamera:
         """The rectified pair of two projections: P2 and P3 of KITTI, P of both `camera_info` of ROS, P1 and P2 of
@@ -117,6 +124,8 @@ class StereoCamera(TensorRecord):
 
         `K = P[:, :3]`, `t_left = K^-1 P_left[:, 3]`, `T_right_cam = [I, t_right - t_left]`: the baseline of an ideal
         pair is `-P_right[0, 3] / P_right[0, 0]`. The matrix K of a `camera_info` is that of the raw images.
+
+        The camera has the dtype of `P_left`, as with `from_intrinsics`.
 
         Raises:
             InputError: wrong shapes or types, a K that has no inverse, or a right camera that is not to the right of
@@ -131,11 +140,11 @@ class StereoCamera(TensorRecord):
             tensor([0.5400])
         """
         cure = "give the projections P, whose fourth column holds the baseline; with K alone there is from_intrinsics"
+        P_left = as_floating(P_left)
         is_one = isinstance(P_left, Tensor) and P_left.ndim == 2
-        check_shape("P_left", P_left, (3, 4) if is_one else ("F", 3, 4), cure)
-        check_shape("P_right", P_right, P_left.shape, cure)
-        if P_left.dtype not in (torch.float32, torch.float64):
-            raise InputError("P_left", "float32 or float64", str(P_left.dtype), "convert it with .float() or .double()")
+        check_shape("P_left", P_left, (3, 4) if is_one else ("F", 3, 4), cure, "floating")
+        P_right = as_floating(P_right, P_left)
+        check_shape("P_right", P_right, P_left.shape, cure, "floating")
         check_alike("P_right", P_right, "P_left", P_left)
         if is_one:
             P_left, P_right = P_left[None], P_right[None]
@@ -198,6 +207,7 @@ class StereoCamera(TensorRecord):
         return -self.T_right_cam[:, 0, 3]
 
     @torch.no_grad()
+    @in_full_precision
     def field_sigma_px(self, frame_index: Tensor, points_cam: Tensor) -> Tensor:
         """Standard deviation (P,) of the disparity field where points (P, 3) of frames (P,) are seen; 0 without one.
 
@@ -216,8 +226,9 @@ class StereoCamera(TensorRecord):
         return from_rotation_translation(torch.eye(3).to(self.t_cam_ref).expand_as(self.K_left), self.t_cam_ref)
 
 
-def _intrinsics(name: str, K: Tensor) -> Tensor:
+def _intrinsics(name: str, K: Given) -> Tensor:
     """Intrinsics (F, 3, 3) of one frame or of F, checked."""
+    K = as_floating(K)
     shape = (3, 3) if isinstance(K, Tensor) and K.ndim == 2 else ("F", 3, 3)
     is_projection = isinstance(K, Tensor) and K.shape[-2:] == (3, 4)
     cure = "for projections P there is from_projections(P_left, P_right)" if is_projection else ""

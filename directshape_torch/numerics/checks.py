@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError, shown
+from directshape_torch.numerics.conversion import FLOATING
 
 # Calibration files have six digits or more, and float32 seven.
 _ROTATION_TOLERANCE = 1e-3
@@ -19,18 +20,17 @@ _WIDEST_PX = 2**31
 Kind = Literal["number", "floating", "image", "index", "flags", "mask"]
 # Kinds that share one dtype in a call.
 FOLLOWING: frozenset[Kind] = frozenset({"floating", "image"})
-_FLOATING = (torch.float32, torch.float64, torch.float16, torch.bfloat16)
 _INTEGERS = (torch.int32, torch.int64)
 _SMALL = (torch.uint8, torch.int8, torch.int16, torch.bool)
 # Dtypes, in words, and the cure. Bytes do not index: they would be taken for a mask.
 _KINDS: dict[Kind, tuple[tuple[torch.dtype, ...], str, str]] = {
-    "number": (_FLOATING + _INTEGERS + _SMALL, "real numbers", ""),
-    "floating": (_FLOATING, "floating point", "convert it with .float() or .double()"),
-    "image": (_FLOATING, "floating point in [0, 1]", "divide by 255"),
+    "number": (FLOATING + _INTEGERS + _SMALL, "real numbers", ""),
+    "floating": (FLOATING, "floating point", "convert it with .float() or .double()"),
+    "image": (FLOATING, "floating point in [0, 1]", "divide by 255"),
     "index": (_INTEGERS, "int64 or int32", "convert it with .long()"),
     "flags": ((torch.bool,), "bool", "convert it with .bool()"),
     "mask": (
-        (*_FLOATING, torch.bool),
+        (*FLOATING, torch.bool),
         "bool, or foreground probabilities in [0, 1] in floating point",
         "divide by 255 where it holds 0..255, and make 0 and 1 bool with .bool()",
     ),
@@ -118,7 +118,7 @@ def check_rotation(
     transform: Tensor,  # (N, 4, 4), finite
 ) -> None:
     """Raise `InputError` unless the upper left part of every transform is a rotation."""
-    cure = "leave scale out of the transform, and build it from a rotation matrix"
+    cure = "leave scale out of the transform, and build it from a rotation matrix in float32 or float64"
     expected = "rotations R with R R^T = I and determinant 1"
     check_rows(name, is_no_rotation(transform), transform[:, :3, :3], expected, cure)
 

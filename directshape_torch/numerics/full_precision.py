@@ -1,14 +1,21 @@
-"""A region in which products of matrices have all the digits of their inputs."""
+"""Regions and functions in which products of matrices have all the digits of their inputs."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from functools import wraps
+from typing import Any, NamedTuple, ParamSpec, TypeGuard, TypeVar
 
 import torch
+from torch import Tensor
+
+from directshape_torch.numerics.conversion import FLOATING, working_dtype
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 # "none": nobody has asked for fewer digits.
 _FULL = ("none", "ieee")
@@ -82,17 +89,70 @@ class _Regions:
 _regions = _Regions()
 
 
+class _Thread(threading.local):
+    """What is known of the thread that asks."""
+
+    is_inside = False  # of a region
+
+
+_thread = _Thread()
+
+
 @contextmanager
-def full_precision(device_type: str) -> Iterator[None]:
-    """No autocast on devices of a type, and no products of float32 with fewer digits, whatever the user has allowed.
+def _no_autocast() -> Iterator[None]:
+    with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
+        yield
+
+
+@contextmanager
+def full_precision() -> Iterator[None]:
+    """No autocast, and no products of float32 with fewer digits, whatever the user has allowed.
 
     Half precision cannot hold pixel coordinates, and TF32, which `torch.set_float32_matmul_precision("high")` allows
     on a graphics card, rounds a coordinate of 30 m to 2 cm. The user's setting is put back at the end. Other than
     autocast it belongs to the process: in the meantime the products of its other threads are exact, too.
     """
+    was_inside = _thread.is_inside
     _regions.enter()
+    _thread.is_inside = True
     try:
-        with torch.autocast(device_type, enabled=False):
+        with _no_autocast():
             yield
     finally:
+        _thread.is_inside = was_inside
         _regions.leave()
+
+
+def in_full_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Mark a function of tensors that users call: it is a region of `full_precision`, and knows one dtype.
+
+    That is the dtype of the first floating-point tensor among the arguments, which the others follow; half precision
+    becomes float32, in which the result is too. Within a region, where all that is done here has been done, a call
+    costs nothing.
+    """
+
+    @wraps(function)
+    def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        if not torch.compiler.is_compiling() and _thread.is_inside:
+            return function(*args, **kwargs)
+        dtype = _dtype_of((*args, *kwargs.values()))
+        named = {name: _of_dtype(value, dtype) for name, value in kwargs.items()}
+        # A compiler can trace autocast, and neither locks nor what belongs to the process.
+        with _no_autocast() if torch.compiler.is_compiling() else full_precision():
+            return function(*(_of_dtype(value, dtype) for value in args), **named)
+
+    return call
+
+
+def _dtype_of(values: tuple[object, ...]) -> torch.dtype:
+    """In which values are computed."""
+    first = next((value.dtype for value in values if _is_floating(value)), torch.float32)
+    return working_dtype(first)
+
+
+def _of_dtype(value: Any, dtype: torch.dtype) -> Any:
+    return value.to(dtype) if _is_floating(value) else value
+
+
+def _is_floating(value: object) -> TypeGuard[Tensor]:
+    return isinstance(value, Tensor) and value.dtype in FLOATING

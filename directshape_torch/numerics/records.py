@@ -123,6 +123,18 @@ class TensorRecord(Record):
             if isinstance(spec, Dense)
         }
 
+    def in_dtype(self, dtype: torch.dtype) -> Self:
+        """The record with its numbers, and those of records in it, in a dtype; masks keep theirs."""
+        changed: dict[str, Any] = {}
+        for each in fields(self):  # type: ignore[arg-type]
+            value, (spec, _) = getattr(self, each.name), self._declared().get(each.name, (None, False))
+            if isinstance(value, TensorRecord):
+                changed[each.name] = value.in_dtype(dtype)
+            elif value is not None and spec is not None and spec.kind in FOLLOWING:
+                changed[each.name] = value.to(dtype)
+        is_same = all(getattr(self, name) is value for name, value in changed.items())
+        return self if is_same else replace(self, **changed)  # type: ignore[type-var]
+
     def tensors(self, name: str) -> Iterator[DeclaredTensor]:
         """All tensors of the record, named `name`, and of those in it."""
         declared = self._declared()

@@ -43,8 +43,8 @@ def check_no_tangents(frames: FrameBatch, detections: Detections, others: Iterab
         )
 
 
-def check_fit(frames: FrameBatch, detections: Detections, prior: ShapePrior) -> None:
-    """Raise `InputError` unless frames, detections and prior share dtype, device, mask size and frame numbers."""
+def in_dtype_of(frames: FrameBatch, detections: Detections) -> Detections:
+    """The detections in the dtype of the frames; raises `InputError` for other records, and for half precision."""
     # By what they have and not by `isinstance`: a record of one's own will do.
     needed = ("frames", frames, FrameBatch, "images_left"), ("detections", detections, Detections, "mask_left")
     for name, given, kind, member in needed:
@@ -58,6 +58,11 @@ def check_fit(frames: FrameBatch, detections: Detections, prior: ShapePrior) -> 
             str(frames.images_left.dtype),
             "refine outside of half precision: .to(dtype=torch.float32) of frames, detections and refiner",
         )
+    return detections.in_dtype(frames.images_left.dtype)
+
+
+def check_fit(frames: FrameBatch, detections: Detections, prior: ShapePrior) -> None:
+    """Raise `InputError` unless frames, detections and prior share dtype, device, mask size and frame numbers."""
     for name, tensor, numbers in (*frames.tensors("frames"), *detections.tensors("detections")):
         wanted = prior.origin.dtype if numbers in FOLLOWING else tensor.dtype
         if tensor.dtype != wanted or tensor.device != prior.origin.device:

@@ -19,6 +19,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, box_corners, rotation_y_from_pose
 from directshape_torch.geometry.box_formats import BoxFormat, poses_to_boxes
 from directshape_torch.numerics.checks import check_alike
+from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.records import CarRecord, Dense
 from directshape_torch.refinement.disparity_profile import DisparityProfile
 from directshape_torch.refinement.observability import Observability
@@ -278,6 +279,7 @@ class RefinementResult(CarRecord):
         """
         return box_corners(*self._boxes(frame))
 
+    @full_precision()
     def _boxes(self, frame: str) -> tuple[Tensor, Tensor]:
         """Poses (B, 4, 4) of the boxes, their origins in the middle of the bottom faces, and dimensions (B, 3)."""
         if frame not in ("ref", "cam"):
@@ -306,6 +308,7 @@ class RefinementResult(CarRecord):
         covariance = bundled_trust_model().calibrated_covariance(self.covariance_xyz_yaw, self.T_cam_obj[:, :3, 3])
         return covariance.diagonal(dim1=1, dim2=2).sqrt()
 
+    @full_precision()
     def mesh(self, index: int) -> trimesh.Trimesh:
         """Surface of one car in the left camera frame, metres, outward normals.
 

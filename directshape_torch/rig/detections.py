@@ -63,8 +63,8 @@ def size_error(
         return 0.0
     if bool(u.min() < _MASK_BORDER_PX) or bool(u.max() >= width - _MASK_BORDER_PX):
         return 0.0
-    corners = torch.tensor([[x * i, y, z * k] for x, y, z in _CORNERS for i in (-1, 1) for k in (-1, 1)])
-    corners_obj = corners.to(T_cam_obj) * dimensions_hwl[[2, 0, 1]]
+    corners = T_cam_obj.new_tensor([[x * i, y, z * k] for x, y, z in _CORNERS for i in (-1, 1) for k in (-1, 1)])
+    corners_obj = corners * dimensions_hwl[[2, 0, 1]]
     corners_v = project(transform(T_cam_obj, corners_obj), K_left)[:, 1]
     height_px = (corners_v.max() - corners_v.min()).double()  # 0 or NaN for a box beyond all numbers
     error = float((v.max() - v.min() + 1) / height_px) / _MASK_OVER_CORNERS - 1

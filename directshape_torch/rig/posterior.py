@@ -38,7 +38,7 @@ _NUM_ITERATIONS = 30
 # Standard deviations of a detector's relative depth and of what is left where it is perfect; each with the middle
 # and the spread (of the logarithm) of what detectors have, from LiDAR to one camera.
 _DEPTH_NOISE, _DEPTH_NOISE_PRIOR = torch.logspace(-2.7, -0.7, 15, dtype=torch.float64), (0.02, 1.2)
-_CONSTANT_NOISE, _CONSTANT_NOISE_PRIOR = torch.tensor([0.15, 0.25, 0.4, 0.7]).double(), (0.2, 0.5)
+_CONSTANT_NOISE, _CONSTANT_NOISE_PRIOR = torch.tensor([0.15, 0.25, 0.4, 0.7], dtype=torch.float32).double(), (0.2, 0.5)
 
 
 class Posterior(NamedTuple):

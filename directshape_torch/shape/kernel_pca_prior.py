@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import check_shape
+from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.shape.pca_fit import fit_pca, training_codes
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.prior_file import PriorProvenance, read_prior, write_prior
@@ -114,6 +115,7 @@ class KernelPCAShapePrior(nn.Module):
         """Codes of the mean of the training cars, (B, K) zeros."""
         return self.anchors.new_zeros(num_objects, self.num_codes)
 
+    @in_full_precision
     def coefficients(self, code: Tensor) -> tuple[Tensor, Tensor]:
         """Coordinates c (B, M) in the subspace for codes (B, K), and `J_c_code` (B, M, K)."""
         check_shape("code", code, ("B", self.num_codes))
@@ -132,6 +134,7 @@ class KernelPCAShapePrior(nn.Module):
         """Signed distance at the nodes, (B, nx, ny, nz), metres, for codes (B, K)."""
         return self.subspace.values(self.coefficients(code)[0])
 
+    @in_full_precision
     def dimensions_and_derivative(self, code: Tensor) -> DimensionsDerivative:
         """Height, width and length (B, 3), metres, linear in the subspace and so curved in the code."""
         c, J_c_code = self.coefficients(code)
@@ -139,6 +142,7 @@ class KernelPCAShapePrior(nn.Module):
         return DimensionsDerivative(at.hwl, at.J_hwl_code @ J_c_code)
 
     @classmethod
+    @in_full_precision
     def fit(
         cls,
         sdf_samples: Tensor,  # (N, nx, ny, nz)
@@ -201,10 +205,12 @@ class CurvedGridShape:
     ) -> None:
         self._grid, self._J_c_code = grid, J_c_code
 
+    @in_full_precision
     def value(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
         """Signed distance (P,) in metres at points (P, 3) of objects (P,)."""
         return self._grid.value(points_obj, object_index)
 
+    @in_full_precision
     def value_and_derivatives(self, points_obj: Tensor, object_index: Tensor) -> SdfDerivatives:
         """Value (P,), gradient (P, 3) and code derivative `J_value_c J_c_code` (P, K)."""
         at = self._grid.value_and_derivatives(points_obj, object_index)

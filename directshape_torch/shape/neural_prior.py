@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from directshape_torch.errors import InputError, shown
 from directshape_torch.numerics.checks import check_shape
+from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.shape.prior_file import PriorProvenance, read_prior, write_prior
 from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivatives
@@ -40,6 +41,7 @@ class CodedLinear(nn.Module):
         self.code_weight = nn.Parameter(torch.randn(outputs, num_codes) * 0.3 * inputs**-0.5)
         self.bias = nn.Parameter(torch.zeros(outputs))
 
+    @in_full_precision
     def shift(self, code: Tensor) -> Tensor:
         """`C code + b`, (B, outputs)."""
         return code @ self.code_weight.T + self.bias
@@ -116,6 +118,7 @@ class NeuralShapePrior(nn.Module):
         """Codes of the mean of the training cars, (B, K) zeros."""
         return self.origin.new_zeros(num_objects, self.num_codes)
 
+    @in_full_precision
     def bind(self, code: Tensor) -> NeuralShape:
         """The fields of B objects with codes (B, K)."""
         check_shape("code", code, ("B", self.num_codes))
@@ -127,6 +130,7 @@ class NeuralShapePrior(nn.Module):
             self.bounds_obj,
         )
 
+    @in_full_precision
     def values(self, code: Tensor) -> Tensor:
         """Signed distance at the nodes of the measuring grid, (B, nx, ny, nz), metres, for codes (B, K)."""
         shape, nodes = self.bind(code), self._nodes()
@@ -134,6 +138,7 @@ class NeuralShapePrior(nn.Module):
         fields = [shape.value(nodes, owner.expand(len(nodes))) for owner in owners]
         return torch.stack(fields).view(-1, *self.grid_shape) if fields else nodes.new_zeros(0, *self.grid_shape)
 
+    @in_full_precision
     def dimensions_and_derivative(self, code: Tensor) -> DimensionsDerivative:
         """Height, width and length (B, 3), metres: a quadratic of the code, fitted to the training cars."""
         check_shape("code", code, ("B", self.num_codes))
@@ -192,6 +197,7 @@ class NeuralShape:
         self._weights, self._code_weights, self._shifts = weights, code_weights, shifts
         self._bounds = bounds_obj
 
+    @in_full_precision
     def value(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
         """Signed distance (P,) in metres at points (P, 3) of objects (P,)."""
         return torch.cat([self._value(*part) for part in _in_parts(points_obj, object_index)])
@@ -203,6 +209,7 @@ class NeuralShape:
             x = nn.functional.silu(self._linear(i, x, object_index))
         return self._linear(-1, x, object_index)[:, 0] + _safe_norm(outward)
 
+    @in_full_precision
     def value_and_derivatives(self, points_obj: Tensor, object_index: Tensor) -> SdfDerivatives:
         """Value (P,), gradient (P, 3) and code derivative (P, K) at points (P, 3) of objects (P,).
 

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import check_alike, check_finite, check_positive, check_shape
+from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.shape.prior_file import PriorProvenance, read_prior, write_prior
 from directshape_torch.shape.sdf_grid import GridShape
@@ -104,6 +105,7 @@ class PCAShapePrior(nn.Module):
         """Codes of the mean shape, (B, K) zeros."""
         return self.mean.new_zeros(num_objects, self.num_codes)
 
+    @in_full_precision
     def values(self, code: Tensor) -> Tensor:
         """Signed distance at the nodes, (B, nx, ny, nz), metres, for codes (B, K)."""
         check_shape("code", code, ("B", self.num_codes))
@@ -114,6 +116,7 @@ class PCAShapePrior(nn.Module):
         """The fields of B objects with codes (B, K): the basis collapses into one grid per object."""
         return GridShape(self.values(code), self.basis, self.origin, self.spacing_m)
 
+    @in_full_precision
     def dimensions_and_derivative(self, code: Tensor) -> DimensionsDerivative:
         """Height, width and length (B, 3), metres, by the linear map of the training cars, and its derivative."""
         check_shape("code", code, ("B", self.num_codes))

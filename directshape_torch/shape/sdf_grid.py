@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding
 
+from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.shape.shape_prior import SdfDerivatives
@@ -61,10 +62,12 @@ class GridShape:
         last = constant_like(tuple(count - 1.0 for count in self.basis.shape[:3]), self.origin)
         return GridField(self.values.reshape(-1), self.basis, self.origin, last, self.spacing_m)
 
+    @in_full_precision
     def value(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
         """Signed distance (P,) in metres at points (P, 3) of objects (P,)."""
         return self.field.value(points_obj.mT.contiguous()[..., None], object_index)[:, 0]
 
+    @in_full_precision
     def value_and_derivatives(self, points_obj: Tensor, object_index: Tensor) -> SdfDerivatives:
         """Value (P,), gradient (P, 3) and code derivative (P, K) at points (P, 3) of objects (P,).
 

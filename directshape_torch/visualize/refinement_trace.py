@@ -98,7 +98,7 @@ def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections
     rows = took_part.nonzero()[:, 0]
     everyone, inputs = refiner.problem(frames, detections)
     problem, initial = everyone.of_problems(took_part), CarState(*(x[rows] for x in inputs))
-    with full_precision(frames.images_left.device.type), compiling(refiner.config.compile, len(detections)):
+    with full_precision(), compiling(refiner.config.compile, len(detections)):
         cars = CarBatch.from_scene(frames, detections).of_cars(took_part)
         start = search_start(problem, initial, cars.search_moves(refiner.config.search))
         minimum = minimise(problem, initial, refiner.config.solver, start, record=True)

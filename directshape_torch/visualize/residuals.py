@@ -118,7 +118,7 @@ def residual_maps(
     config = replace(config, method="direct", compile="off", sampling=sampling)
     frame, detections = loaded.frame, loaded.detections
     chosen, found = torch.zeros(len(detections), dtype=torch.bool).index_fill(0, rows, True), []
-    with full_precision(frame.images_left.device.type):
+    with full_precision():
         of_all, inputs = DirectShapeRefiner(prior, config).problem(frame, detections)
         problem, start = of_all.of_problems(chosen), CarState(*(x[rows] for x in inputs))
         pixels = pack_pixels(frame, detections, sampling).of_objects(chosen)

@@ -57,7 +57,7 @@ def test_weights_of_terms(name: str) -> None:
         REFINE.run({**REFINE.arguments, "weight": value})
 
 
-@pytest.mark.parametrize("place", ["frames.camera", "frames.ground", "detections.occluders"])
+@pytest.mark.parametrize("place", ["frames.camera", "frames.ground"])
 def test_a_part_of_other_precision_is_named(place: str) -> None:
     record, name = place.split(".")
     frames, detections = whole_call()

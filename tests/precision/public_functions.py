@@ -1,0 +1,397 @@
+"""Every public function of tensors with arguments for it, by the name under which it is found in the package."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from types import FunctionType, ModuleType
+from typing import Any
+
+import torch
+from helpers.ellipsoids import ellipsoid_prior
+from helpers.synthetic_scene import cached_street
+from torch import Tensor
+
+import directshape_torch
+from directshape_torch import (
+    Detections,
+    DirectShapeRefiner,
+    DisparityField,
+    FrameBatch,
+    GroundPlane,
+    PCAShapePrior,
+    RefinementResult,
+    RigEstimate,
+    StereoCamera,
+    check_scene,
+    fit_shape,
+    load_config,
+)
+from directshape_torch.evaluation import pose_error, rotated_iou
+from directshape_torch.geometry import box3d, box_formats, disparity_field, image_boxes, projection, se3
+from directshape_torch.shape import pca_fit, zero_level
+from directshape_torch.shape.kernel_pca_prior import KernelPCAShapePrior
+from directshape_torch.shape.neural_prior import NeuralShapePrior
+from directshape_torch.shape.prior_file import PriorProvenance
+from directshape_torch.shape.sdf_grid import GridShape
+
+MODULES = (
+    "directshape_torch.evaluation.pose_error",
+    "directshape_torch.evaluation.rotated_iou",
+    "directshape_torch.shape.kernel_pca_prior",
+    "directshape_torch.shape.neural_prior",
+    "directshape_torch.shape.pca_fit",
+    "directshape_torch.shape.zero_level",
+)
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Tensors of one dtype in which no product is exact in fewer digits than float32 has."""
+
+    uv: Tensor  # (20, 2) pixels
+    depth: Tensor  # (20,) metres
+    points: Tensor  # (20, 3) metres, in the camera frame
+    near: Tensor  # (20, 3) metres, in the object frame
+    twist: Tensor  # (2, 6)
+    T: Tensor  # (2, 4, 4)
+    T_cam_lidar: Tensor  # (4, 4), turned by right angles
+    K: Tensor  # (3, 3)
+    T_right_cam: Tensor  # (4, 4)
+    P_left: Tensor  # (1, 3, 4)
+    P_right: Tensor  # (1, 3, 4)
+    boxes: Tensor  # (2, 7)
+    boxes_beside: Tensor  # (2, 7), partly in the same place
+    hwl: Tensor  # (2, 3)
+    code: Tensor  # (2, 3)
+    images: Tensor  # (1, 3, 120, 160)
+
+    def to(self, dtype: torch.dtype) -> Numbers:
+        return Numbers(**{name: value.to(dtype) for name, value in vars(self).items()})
+
+
+@cache
+def numbers() -> Numbers:
+    """Of float32."""
+    chance = torch.Generator().manual_seed(0)
+
+    def between(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(shape, generator=chance)
+
+    K = torch.tensor([[721.5377, 0.0, 609.5593], [0.0, 721.5377, 172.854], [0.0, 0.0, 1.0]])
+    T_right_cam, T_cam_lidar = torch.eye(4), torch.zeros(4, 4)
+    T_right_cam[:3, 3] = torch.tensor([-0.5327, 0.0027, 0.0031])
+    T_cam_lidar[0, 1] = T_cam_lidar[1, 2] = -1
+    T_cam_lidar[2, 0] = T_cam_lidar[3, 3] = 1
+    T_cam_lidar[:3, 3] = torch.tensor([0.0613, -0.0871, -0.2713])
+    points = torch.stack([between(-9, 9, 20), between(-1, 2, 20), between(7, 40, 20)], dim=1)
+    twist = between(-1, 1, 2, 6)
+    boxes = torch.stack([points[0], points[1]])
+    sizes = torch.tensor([[1.523, 1.617, 4.013, 0.317], [1.481, 1.703, 4.391, -1.217]])
+    boxes = torch.cat([boxes, sizes], dim=1)
+    P_left, P_right = (
+        torch.cat([K, torch.tensor(x)], dim=1)[None]
+        for x in ([[44.857], [0.216], [0.003]], [[-339.524], [2.199], [0.003]])
+    )
+    return Numbers(
+        uv=between(3, 157, 20, 2),
+        depth=between(7, 40, 20),
+        points=points,
+        near=between(-1.2, 1.2, 20, 3),
+        twist=twist,
+        T=se3.exp(twist.double()).float(),
+        T_cam_lidar=T_cam_lidar,
+        K=K,
+        T_right_cam=T_right_cam,
+        P_left=P_left,
+        P_right=P_right,
+        boxes=boxes,
+        boxes_beside=boxes + 0.31,
+        hwl=sizes[:, :3],
+        code=between(-2, 2, 2, 3),
+        images=between(0, 1, 1, 3, 120, 160),
+    )
+
+
+def rig(n: Numbers) -> tuple[Tensor, Tensor, Tensor]:
+    return n.K, n.K, n.T_right_cam
+
+
+def field(n: Numbers) -> DisparityField:
+    made = DisparityField.constant(-0.4173, (160, 120), *rig(n))
+    some = 0.1 * torch.sin(torch.arange(100, dtype=torch.float64)).view(10, 10)
+    parts = some[0], some[1], some @ some.mT
+    names = ("coefficients", "vertical_coefficients", "covariance")
+    return replace(made, **{name: part.float() for name, part in zip(names, parts, strict=True)})
+
+
+def camera(n: Numbers) -> StereoCamera:
+    return StereoCamera.from_intrinsics(n.K, 0.5327, disparity_field=field(n))
+
+
+def camera_parts(made: StereoCamera) -> list[Tensor]:
+    return [made.K_left, made.K_right, made.T_right_cam, made.t_cam_ref]
+
+
+def of_kornia() -> StereoCamera:
+    from kornia.geometry.camera import PinholeCamera
+
+    eye = torch.eye(4, dtype=torch.float32)[None]
+    wide, size = eye.clone(), torch.tensor([120])
+    wide[0, :3, :3] = numbers().K
+    left, right = eye, numbers().T_right_cam[None]
+    return StereoCamera.from_kornia(PinholeCamera(wide, left, size, size), PinholeCamera(wide, right, size, size))
+
+
+def detections(n: Numbers) -> Detections:
+    mask = torch.zeros(2, 120, 160, dtype=torch.bool)
+    mask[:, 40:80, 30:90] = True
+    return Detections.from_boxes(
+        n.boxes,
+        "mmdet3d_lidar",
+        mask_left=mask,
+        T_cam_boxes=n.T_cam_lidar,
+        score=n.depth[:2],
+        pose_sigma=n.twist[:, :4].abs(),
+    )
+
+
+def frames(n: Numbers) -> FrameBatch:
+    return FrameBatch.from_images(n.images, n.images, StereoCamera.from_intrinsics(n.K, 0.5327), 1.6573)
+
+
+def tensors(record: Any) -> list[Tensor]:
+    return [each.value for each in record.tensors("")]
+
+
+@cache
+def grids() -> PCAShapePrior:
+    return ellipsoid_prior(torch.float32)
+
+
+@cache
+def curved() -> KernelPCAShapePrior:
+    codes = torch.randn(8, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float32)
+    made = PriorProvenance("a test", "Apache-2.0", 8)
+    return KernelPCAShapePrior.fit(grids().values(codes), grids().origin, 0.2, 3, made, num_components=3)
+
+
+@cache
+def network() -> NeuralShapePrior:
+    torch.manual_seed(0)
+    made = PriorProvenance("a test", "Apache-2.0", 8)
+    prior = NeuralShapePrior([16, 16], 3, torch.tensor([-2.8, -2.2, -1.6]), (8, 8, 8), 0.7, made)
+    prior.dimensions_linear_hwl.normal_()
+    prior.dimensions_quadratic_hwl.normal_()
+    return prior
+
+
+FOOTPRINT = [0, 2, 5, 4, 6]
+OWNERS = torch.arange(20) % 2
+Prior = PCAShapePrior | KernelPCAShapePrior | NeuralShapePrior
+
+
+def of_prior(name: str, shape: str, make: Callable[[], Prior]) -> dict[str, Case]:
+    """What each family of shapes offers."""
+    return {
+        f"{name}.values": lambda n: make().values(n.code),
+        f"{name}.dimensions_and_derivative": lambda n: make().dimensions_and_derivative(n.code),
+        f"{name}.bind": lambda n: make().bind(n.code).value(n.near, OWNERS),
+        f"{name}.bounds_obj": lambda _: make().bounds_obj,
+        f"{name}.initial_code": lambda _: make().initial_code(2),
+        f"{shape}.value": lambda n: make().bind(n.code).value(n.near, OWNERS),
+        f"{shape}.value_and_derivatives": lambda n: make().bind(n.code).value_and_derivatives(n.near, OWNERS),
+    }
+
+
+@cache
+def street() -> tuple[FrameBatch, Detections]:
+    _, made = cached_street()
+    return made.frames.to(torch.float32), made.detections.to(torch.float32)
+
+
+@cache
+def refiner() -> DirectShapeRefiner:
+    quick = ["stages=[{contour_width_px: 0.5, image_level: 0, max_iterations: 2}]", "compile=off", "check=off"]
+    return DirectShapeRefiner(grids(), load_config(None, quick))
+
+
+@cache
+def result() -> RefinementResult:
+    with torch.no_grad():
+        found: RefinementResult = refiner()(*street())
+    return found
+
+
+def read_back() -> RefinementResult:
+    return RefinementResult.from_state_dict(result().state_dict(), grids())
+
+
+def estimate() -> RigEstimate:
+    made = RigEstimate.of_frames(street()[0])
+    made.update(*street())
+    return made
+
+
+def with_rows(rows: Tensor) -> RigEstimate:
+    made = RigEstimate.of_frames(street()[0])
+    made.add_rows(rows)
+    return made
+
+
+def fitted(n: Numbers) -> list[Tensor]:
+    chance = torch.Generator().manual_seed(2)
+    points = numbers().boxes[:1, :3] + 1.5 * (torch.rand(200, 3, generator=chance, dtype=torch.float32) - 0.5)
+    fit = fit_shape(points, n.boxes[:1], "opencv", grids())
+    return [fit.cars.T_cam_obj, fit.cars.code, fit.distance_before_m, fit.distance_after_m, fit.cars.covariance_xyz_yaw]
+
+
+def samples() -> Tensor:
+    return grids().values(torch.eye(4, 3, dtype=torch.float32))
+
+
+Case = Callable[[Numbers], Any]
+# What a `Numbers` gives that is compared: tensors, arrays, or records and tuples of them.
+CASES: dict[str, Case] = {
+    "se3.generators": lambda _: se3.generators(),
+    "se3.exp": lambda n: se3.exp(n.twist),
+    "se3.inverse": lambda n: se3.inverse(n.T),
+    "se3.transform": lambda n: se3.transform(n.T[0], n.points),
+    "se3.from_rotation_translation": lambda n: se3.from_rotation_translation(n.T[:, :3, :3], n.points[:2]),
+    "se3.to_kornia": lambda n: se3.to_kornia(n.T).matrix(),
+    "se3.from_kornia": lambda n: se3.from_kornia(se3.to_kornia(n.T)),
+    "projection.rays_from_pixels": lambda n: projection.rays_from_pixels(n.uv, n.K),
+    "projection.project": lambda n: projection.project(n.points, n.K),
+    "projection.warp_to_right": lambda n: projection.warp_to_right(n.points, n.depth, n.K, n.T_right_cam, n.depth),
+    "projection.right_rays": lambda n: projection.right_rays(n.uv, n.K, n.T_right_cam, n.depth, n.depth),
+    "projection.disparity_of_depth": lambda n: projection.disparity_of_depth(n.uv, n.depth, *rig(n)),
+    "projection.depth_from_disparity": lambda n: projection.depth_from_disparity(n.uv, n.depth, *rig(n), field(n)),
+    "projection.points_from_disparity": lambda n: projection.points_from_disparity(n.uv, n.depth, *rig(n)),
+    "box3d.rotation_about_y": lambda n: box3d.rotation_about_y(n.depth),
+    "box3d.pose_from_kitti": lambda n: box3d.pose_from_kitti(n.points, n.depth),
+    "box3d.rotation_y_from_pose": lambda n: box3d.rotation_y_from_pose(n.T),
+    "box3d.wrap_angle": lambda n: box3d.wrap_angle(n.depth),
+    "box3d.alpha_from_kitti": lambda n: box3d.alpha_from_kitti(n.points, n.depth),
+    "box3d.viewing_axes": lambda n: box3d.viewing_axes(n.points),
+    "box3d.box_corners": lambda n: box3d.box_corners(n.T, n.hwl),
+    "box_formats.boxes_to_poses": lambda n: [
+        *box_formats.boxes_to_poses(n.boxes, "kitti"),
+        *box_formats.boxes_to_poses(n.boxes, "nuscenes", n.T_cam_lidar),
+        *box_formats.boxes_to_poses(box3d.box_corners(*box_formats.boxes_to_poses(n.boxes, "kitti")), "kitti"),
+    ],
+    "box_formats.poses_to_boxes": lambda n: [
+        box_formats.poses_to_boxes(n.T, n.hwl, "opencv"),
+        box_formats.poses_to_boxes(n.T, n.hwl, "nuscenes", n.T_cam_lidar),
+    ],
+    "image_boxes.project_boxes": lambda n: image_boxes.project_boxes(n.T, n.hwl, camera(n), (120, 160)),
+    "disparity_field.polynomial_basis": lambda n: disparity_field.polynomial_basis(n.uv, (160, 120)),
+    "disparity_field.nearest_in_convex_polygon": lambda n: disparity_field.nearest_in_convex_polygon(
+        n.uv, torch.tensor([[10.0, 10.0], [50.0, 20.0], [30.0, 70.0]]).to(n.uv)
+    ),
+    "DisparityField.constant": lambda n: DisparityField.constant(-0.4173, (160, 120), *rig(n)).bias(n.uv),
+    "DisparityField.bias": lambda n: field(n).bias(n.uv),
+    "DisparityField.offsets": lambda n: field(n).offsets(n.uv),
+    "DisparityField.sigma": lambda n: field(n).sigma(n.uv),
+    "GroundPlane.from_camera_height": lambda _: [*tensors(GroundPlane.from_camera_height(1.6573))],
+    "StereoCamera.from_intrinsics": lambda n: camera_parts(StereoCamera.from_intrinsics(n.K, n.depth[0], n.K)),
+    "StereoCamera.from_projections": lambda n: camera_parts(StereoCamera.from_projections(n.P_left, n.P_right)),
+    "StereoCamera.from_kornia": lambda _: camera_parts(of_kornia()),
+    "StereoCamera.baseline": lambda n: camera(n).baseline,
+    "StereoCamera.T_cam_ref": lambda n: camera(n).T_cam_ref,
+    "StereoCamera.field_sigma_px": lambda n: camera(n).field_sigma_px(torch.zeros(20, dtype=torch.long), n.points),
+    "FrameBatch.from_images": lambda n: tensors(frames(n)),
+    "Detections.from_boxes": lambda n: tensors(detections(n)),
+    **of_prior("PCAShapePrior", "GridShape", grids),
+    **of_prior("KernelPCAShapePrior", "CurvedGridShape", curved),
+    **of_prior("NeuralShapePrior", "NeuralShape", network),
+    "KernelPCAShapePrior.coefficients": lambda n: curved().coefficients(n.code),
+    "KernelPCAShapePrior.fit": lambda _: [*curved.__wrapped__().buffers()],
+    "CodedLinear.shift": lambda n: network().coded_layers()[0].shift(n.code),
+    "pca_fit.fit_pca": lambda _: [*pca_fit.fit_pca(samples(), grids().origin, 0.2, 2, grids().provenance).buffers()],
+    "pca_fit.training_codes": lambda _: pca_fit.training_codes(samples(), 2),
+    "pca_fit.fit_car": lambda _: pca_fit.fit_car(grids(), samples()[1]),
+    "pca_fit.leave_one_out_errors_cm": lambda _: pca_fit.leave_one_out_errors_cm(samples(), grids()),
+    "zero_level.zero_level_extents": lambda _: zero_level.zero_level_extents(samples(), grids().origin, 0.2),
+    "zero_level.sdf_to_mesh": lambda n: zero_level.sdf_to_mesh(samples()[0], grids().origin, 0.2, n.T[0]).vertices,
+    "rotated_iou.bev_boxes": lambda n: rotated_iou.bev_boxes(n.boxes),
+    "rotated_iou.bev_iou": lambda n: rotated_iou.bev_iou(n.boxes[:, FOOTPRINT], n.boxes_beside[:, FOOTPRINT]),
+    "rotated_iou.iou_3d": lambda n: rotated_iou.iou_3d(n.boxes, n.boxes_beside),
+    "pose_error.pose_errors": lambda n: pose_error.pose_errors(n.boxes, n.boxes_beside),
+    "fit_shape.fit_shape": fitted,
+    "check_scene.check_scene": lambda _: str(check_scene(*street(), match_images=False)),
+    "DirectShapeRefiner.forward": lambda _: refiner()(*street()).state_dict(),
+    "DirectShapeRefiner.problem": lambda _: [*refiner().problem(*street())[1]],
+    "RefinementResult.boxes": lambda _: vars(result().boxes()),
+    "RefinementResult.to_boxes": lambda n: result().to_boxes("nuscenes", T_cam_boxes=n.T_cam_lidar),
+    "RefinementResult.corners": lambda _: result().corners(),
+    "RefinementResult.T_ref_obj": lambda _: result().T_ref_obj,
+    "RefinementResult.sigma_xyz_yaw": lambda _: result().sigma_xyz_yaw,
+    "RefinementResult.mesh": lambda _: result().mesh(0).vertices,
+    "RefinementResult.meshes": lambda _: [mesh.vertices for mesh in result().meshes()],
+    "RefinementResult.numpy": lambda _: {k: v for k, v in result().numpy().items() if v.dtype.kind == "f"},
+    "RefinementResult.from_state_dict": lambda _: read_back().state_dict(),
+    "Observability.words": lambda _: "".join(result().observability.words()),
+    "DisparityProfile.after": lambda _: result().profile.after,
+    "DisparityProfile.before": lambda _: result().profile.before,
+    "RigEstimate.of_frames": lambda _: estimate().mean,
+    "RigEstimate.update": lambda _: estimate().rows,
+    "RigEstimate.mean": lambda _: estimate().mean,
+    "RigEstimate.covariance": lambda _: estimate().covariance,
+    "RigEstimate.detector": lambda _: torch.tensor(estimate().detector, dtype=torch.float64),
+    "RigEstimate.field": lambda _: estimate().field.coefficients,
+    "RigEstimate.offset_at": lambda n: estimate().offset_at(n.uv),
+    "RigEstimate.corrected": lambda n: estimate().corrected(street()[0]).camera.disparity_field.bias(n.uv),
+    "RigEstimate.informed": lambda _: tensors(estimate().informed(estimate().corrected(street()[0]), street()[1])),
+    "DisparityProfile.lowest": lambda _: result().profile.lowest,
+    "DisparityProfile.cost_at": lambda _: result().profile.cost_at(0.5),
+    "RigEstimate.add_rows": lambda _: with_rows(torch.full((1, 8), 7.3, dtype=torch.float32)).mean,
+    "RigEstimate.in_the_middle": lambda _: torch.tensor(estimate().in_the_middle(), dtype=torch.float64),
+    "RigEstimate.metres_per_pixel": lambda _: torch.tensor(estimate().metres_per_pixel(20.0), dtype=torch.float64),
+    "RigEstimate.along_the_width": lambda _: estimate().along_the_width(),
+}  # fmt: skip
+
+
+# These compute nothing from tensors, or are what another one here calls.
+WITHOUT_NUMBERS = {
+    "CheckReport.count", "CheckReport.exit_code", "DisparityField.check_rig", "DisparityField.rig", "DisparityField.to",
+    "Finding.block", "GridShape.field", "KernelPCAShapePrior.load", "KernelPCAShapePrior.num_codes",
+    "KernelPCAShapePrior.origin", "KernelPCAShapePrior.provenance", "KernelPCAShapePrior.save",
+    "KernelPCAShapePrior.spacing_m", "NeuralShapePrior.coded_layers", "NeuralShapePrior.load",
+    "NeuralShapePrior.load_bundled", "NeuralShapePrior.save", "PCAShapePrior.get_extra_state", "PCAShapePrior.load",
+    "PCAShapePrior.load_bundled", "PCAShapePrior.num_codes", "PCAShapePrior.save", "PCAShapePrior.set_extra_state",
+    "RefinementResult.refined", "RefinementResult.rows", "RefinementResult.status", "RefinementResult.to",
+    "RigEstimate.add_pixels", "RigEstimate.content", "RigEstimate.get_extra_state", "RigEstimate.is_guess",
+    "RigEstimate.is_of", "RigEstimate.of_content", "RigEstimate.set_extra_state", "ShapeFit.arrays", "Status.code",
+    "Status.from_code", "Status.is_refined", "StereoCamera.num_frames", "box_formats.is_z_up",
+    "config_files.load_config",
+    "image_boxes.box_iou", "kornia_cameras.stereo_camera_of", "pose_error.boxes_of", "pose_error.errors_of",
+}  # fmt: skip
+
+
+def public_names() -> set[str]:
+    """Functions, and methods and properties of classes, that the package exports or that its modules here hold."""
+    inside = importlib.import_module("directshape_torch.geometry")
+    geometry = [each.name for each in pkgutil.iter_modules(inside.__path__, f"{inside.__name__}.")]
+    modules = [importlib.import_module(name) for name in (*geometry, *MODULES)]
+    found = [value for module in modules for value in vars(module).values() if _is_of(module, value)]
+    exported = [getattr(directshape_torch, name) for name in directshape_torch.__all__]
+    return {name for value in (*found, *exported, GridShape) for name in _names_of(value)}
+
+
+def _is_of(module: ModuleType, value: object) -> bool:
+    return getattr(value, "__module__", None) == module.__name__ and not value.__name__.startswith("_")
+
+
+def _names_of(value: Any) -> Iterator[str]:
+    """The name of a function behind its module's, or of the members of a class behind its own."""
+    if inspect.isfunction(value):
+        yield f"{value.__module__.rpartition('.')[2]}.{value.__name__}"
+    elif inspect.isclass(value) and not getattr(value, "_is_protocol", False) and not issubclass(value, Exception):
+        kinds = (FunctionType, property, classmethod, staticmethod)
+        for name, member in vars(value).items():
+            if not name.startswith("_") and isinstance(member, kinds):
+                yield f"{value.__name__}.{name}"
