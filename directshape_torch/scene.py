@@ -112,8 +112,8 @@ class FrameBatch(TensorRecord):
     ) -> FrameBatch:
         """Frames without padding, of RGB images in floating point in [0, 1] or uint8.
 
-        All follow the left images, camera, ground, times and poses too, to their device and their dtype: float32 or
-        float64; bytes and half precision become float32. Arrays and lists are taken for tensors.
+        All follow the left images, camera, ground, times and poses too, to their device and their dtype. That is
+        float64 for tensors of float64, else float32: for arrays, bytes and half precision too.
 
         Args:
             images_left, images_right: rectified pairs.
@@ -356,12 +356,13 @@ class Detections(TensorRecord):
 
 def _as_images(name: str, images: Given) -> Tensor:
     """RGB (F, 3, H, W) in [0, 1], in float32 or float64."""
+    dtype = working_dtype(images.dtype) if isinstance(images, Tensor) else torch.float32
     images = as_tensor(images)
     shape = (3, "H", "W") if isinstance(images, Tensor) and images.ndim == 3 else ("F", 3, "H", "W")
     is_bytes = isinstance(images, Tensor) and images.dtype == torch.uint8
     check_shape(name, images, shape, "colours come first: image.permute(2, 0, 1)", "number" if is_bytes else "image")
     images = images if images.ndim == 4 else images[None]
-    return images.float() / 255 if is_bytes else images.to(working_dtype(images.dtype))
+    return images.to(dtype) / 255 if is_bytes else images.to(dtype)
 
 
 def _cut_masks(instances: Detections | Occluders) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from types import ModuleType, SimpleNamespace
@@ -12,8 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.ellipsoids import ellipsoid_prior
 from helpers.synthetic_scene import cached_street, disturbed
 from safetensors.torch import load, save
+from torch import Tensor
 
 from directshape_torch import (
     Detections,
@@ -26,6 +29,7 @@ from directshape_torch import (
     StereoCamera,
 )
 from directshape_torch.geometry.box_formats import poses_to_boxes
+from directshape_torch.numerics.records import TensorRecord
 from directshape_torch.status import Status
 
 PRIOR, STREET = cached_street()
@@ -88,6 +92,118 @@ def test_projections_of_one_frame_and_their_mistakes() -> None:
         StereoCamera.from_intrinsics(P_left, 0.54)
     with pytest.raises(InputError, match=r"baseline_m: .*-P_right\[0, 3\] / P_right\[0, 0\]"):
         StereoCamera.from_intrinsics(K, -0.54)
+
+
+def same(a: TensorRecord, b: TensorRecord) -> bool:
+    pairs = zip(a.tensors(""), b.tensors(""), strict=True)
+    return all(x.value.dtype == y.value.dtype and x.value.equal(y.value) for x, y in pairs)
+
+
+MOTION = torch.eye(4)
+MOTION[:3, 3] = torch.tensor([0.1, -0.2, 0.3])
+GIVEN = {
+    "frame_index": torch.tensor([0, 0]),
+    "score": torch.tensor([0.5, 0.75]),
+    "box_2d": torch.tensor([[10.0, 20.0, 30.0, 40.0], [20.0, 20.0, 50.0, 60.0]]),
+    "pose_sigma": torch.full((2, 4), 0.5),
+    "track_id": torch.tensor([3, -1]),
+    "has_mask_left": torch.tensor([True, False]),
+    "T_cam_boxes": MOTION,
+}
+
+
+@pytest.mark.parametrize("name", GIVEN)
+@pytest.mark.parametrize(
+    "form", [torch.Tensor.tolist, torch.Tensor.numpy, lambda x: np.flip(np.flip(x.numpy()).copy())]
+)
+def test_what_goes_with_boxes_may_be_arrays_and_lists(name: str, form: Callable[[Tensor], object]) -> None:
+    expected = from_boxes(**{name: GIVEN[name].double() if GIVEN[name].is_floating_point() else GIVEN[name]})
+    assert same(from_boxes(**{name: form(GIVEN[name])}), expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int32])
+def test_whole_numbers_of_any_width_count_frames(dtype: torch.dtype) -> None:
+    assert same(from_boxes(frame_index=torch.zeros(2, dtype=dtype)), from_boxes())
+    assert same(from_boxes(frame_index=torch.zeros(2, dtype=dtype).numpy()), from_boxes())
+
+
+@pytest.mark.parametrize("wrong", [[0.0, 0.5], [True, False], ["0", "0"], [None, None]])
+def test_other_things_do_not_count_frames(wrong: object) -> None:
+    with pytest.raises(InputError, match=r"^frame_index: expected "):
+        from_boxes(frame_index=wrong)
+
+
+@pytest.mark.parametrize(
+    ("form", "dtype"),
+    [
+        (torch.Tensor.numpy, torch.float64),
+        (torch.Tensor.tolist, torch.float64),
+        (torch.Tensor.float, torch.float32),
+        (torch.Tensor.bfloat16, torch.float32),
+        (lambda x: x.half().numpy(), torch.float32),
+    ],
+)
+def test_boxes_of_any_dtype(form: Callable[[Tensor], Any], dtype: torch.dtype) -> None:
+    d = STREET.detections
+    boxes = poses_to_boxes(d.T_cam_obj, d.dimensions_hwl, "opencv")
+    given = form(boxes)
+    found = Detections.from_boxes(given, "opencv", mask_left=d.mask_left)
+    expected = Detections.from_boxes(
+        (given if isinstance(given, Tensor) else torch.from_numpy(np.asarray(given))).to(dtype),
+        "opencv",
+        mask_left=d.mask_left,
+    )
+    assert same(found, expected)
+    assert found.T_cam_obj.dtype == found.score.dtype == found.box_2d.dtype == dtype
+
+
+def test_detections_follow_the_frames() -> None:
+    frames, detections = STREET.frames.to(torch.float32), disturbed(STREET.detections)
+    refiner = DirectShapeRefiner(ellipsoid_prior(torch.float32))
+    expected, found = refiner(frames, detections.to(torch.float32)), refiner(frames, detections)
+    assert found.T_cam_obj.dtype == torch.float32
+    assert found.T_cam_obj.equal(expected.T_cam_obj)
+
+
+@pytest.mark.parametrize("form", [torch.Tensor.numpy, torch.Tensor.tolist, torch.Tensor.double, torch.Tensor.float])
+def test_camera_ground_and_motion_follow_the_images(form: Callable[[Tensor], Any]) -> None:
+    K, image, at = torch.tensor([[64.0, 0, 15], [0, 64, 10], [0, 0, 1]]), torch.rand(3, 20, 30), torch.tensor([0.5])
+    camera = StereoCamera.from_intrinsics(form(K), form(torch.tensor(0.5)), form(K))
+    ground = form(torch.tensor(1.5))
+    moved = {"time_s": form(at), "T_world_cam": form(MOTION[None])}
+    frames = FrameBatch.from_images(image, image, camera, ground, **moved)
+    plain = StereoCamera.from_intrinsics(K, 0.5)
+    assert same(frames, FrameBatch.from_images(image, image, plain, 1.5, time_s=at, T_world_cam=MOTION[None]))
+
+
+@pytest.mark.parametrize("K_dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("form", "dtype"),
+    [
+        (lambda x: x, torch.float32),
+        (torch.Tensor.double, torch.float64),
+        (torch.Tensor.bfloat16, torch.float32),
+        (lambda x: x.double().numpy(), torch.float32),
+        (lambda x: (255 * x).byte().numpy(), torch.float32),
+    ],
+)
+def test_images_say_the_dtype(form: Callable[[Tensor], Any], dtype: torch.dtype, K_dtype: torch.dtype) -> None:
+    K, image = torch.tensor([[64.0, 0, 15], [0, 64, 10], [0, 0, 1]], dtype=K_dtype), form(torch.rand(3, 20, 30))
+    frames = FrameBatch.from_images(image, image, StereoCamera.from_intrinsics(K, 0.5))
+    assert {each.value.dtype for each in frames.tensors("") if each.kind != "index"} == {dtype}
+
+
+def test_a_refiner_and_a_result_in_half_precision_are_refused() -> None:
+    with pytest.raises(InputError, match=r"^refiner: expected shapes in float32 or float64, got torch.bfloat16"):
+        DirectShapeRefiner(ellipsoid_prior()).bfloat16()(STREET.frames, STREET.detections)
+    with pytest.raises(
+        InputError, match=r"^dtype: expected float32 or float64, got torch.float16; convert what to_boxes"
+    ):
+        refined().to(torch.float16)
+    with pytest.raises(
+        InputError, match=r"^code: expected the dtype of the prior \(torch.float64\), got torch.float32"
+    ):
+        PRIOR.values(torch.zeros(1, 3))
 
 
 def test_images_may_be_bytes() -> None:

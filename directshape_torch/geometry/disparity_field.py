@@ -16,6 +16,7 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import check_finite, check_shape, check_size_wh
+from directshape_torch.numerics.conversion import as_floating
 from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.numerics.gradient_mode import is_plain
 
@@ -133,6 +134,7 @@ class DisparityField:
             tensor([-0.4000])
         """
         check_size_wh("size_wh", size_wh)
+        K_left, K_right, T_right_cam = (as_floating(matrix) for matrix in (K_left, K_right, T_right_cam))
         check_shape("K_left", K_left, (3, 3), kind="floating")
         coefficients = torch.zeros(NUM_COEFFICIENTS, dtype=K_left.dtype, device=K_left.device)
         coefficients[0] = value_px

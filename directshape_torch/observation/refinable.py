@@ -63,6 +63,9 @@ def in_dtype_of(frames: FrameBatch, detections: Detections) -> Detections:
 
 def check_fit(frames: FrameBatch, detections: Detections, prior: ShapePrior) -> None:
     """Raise `InputError` unless frames, detections and prior share dtype, device, mask size and frame numbers."""
+    if prior.origin.dtype not in _DTYPES:
+        cure = "make it anew in float32, and leave it out of what .half() or .bfloat16() is called on"
+        raise InputError("refiner", "shapes in float32 or float64", str(prior.origin.dtype), cure)
     for name, tensor, numbers in (*frames.tensors("frames"), *detections.tensors("detections")):
         wanted = prior.origin.dtype if numbers in FOLLOWING else tensor.dtype
         if tensor.dtype != wanted or tensor.device != prior.origin.device:

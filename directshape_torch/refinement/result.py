@@ -19,6 +19,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, box_corners, rotation_y_from_pose
 from directshape_torch.geometry.box_formats import BoxFormat, poses_to_boxes
 from directshape_torch.numerics.checks import check_alike
+from directshape_torch.numerics.conversion import working_dtype
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.records import CarRecord, Dense
 from directshape_torch.refinement.disparity_profile import DisparityProfile
@@ -145,9 +146,15 @@ class RefinementResult(CarRecord):
         return replace(super().rows(index), ground_source=sources)
 
     def to(self, device: torch.device | torch.dtype | str | None = None, dtype: torch.dtype | None = None) -> Self:
-        """On another device, poses, codes and shapes of another dtype; a prior that moves is a copy."""
+        """On another device, poses, codes and shapes of another dtype; a prior that moves is a copy.
+
+        Raises:
+            InputError: half precision, which cannot hold a pose.
+        """
         if isinstance(device, torch.dtype):
             device, dtype = None, device
+        if dtype is not None and dtype != working_dtype(dtype):
+            raise InputError("dtype", "float32 or float64", str(dtype), "convert what to_boxes gives instead")
         moved = super().to(device)
         if dtype is not None:
             like_input = ("T_cam_obj", "code", "input_dimensions_hwl", "t_cam_ref")

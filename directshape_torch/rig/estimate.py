@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, DisparityField
 from directshape_torch.numerics.checks import check_shape
+from directshape_torch.numerics.conversion import as_floating
 from directshape_torch.rig.detections import COLUMNS, observe_detections
 from directshape_torch.rig.pixels import PixelEvidence, hull
 from directshape_torch.rig.posterior import BIAS, Posterior, solve_offsets, solve_rows
@@ -67,6 +68,7 @@ class RigEstimate(nn.Module):
 
     def __init__(self, size_wh: tuple[int, int], K_left: Tensor, K_right: Tensor, T_right_cam: Tensor) -> None:
         super().__init__()
+        K_left, K_right, T_right_cam = (as_floating(matrix) for matrix in (K_left, K_right, T_right_cam))
         for name, matrix, size in (("K_left", K_left, 3), ("K_right", K_right, 3), ("T_right_cam", T_right_cam, 4)):
             check_shape(name, matrix, (size, size), kind="floating")
         matrices = (matrix.detach().double().cpu() for matrix in (K_left, K_right, T_right_cam))

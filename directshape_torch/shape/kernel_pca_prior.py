@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from directshape_torch.errors import InputError
-from directshape_torch.numerics.checks import check_shape
+from directshape_torch.numerics.checks import check_alike, check_shape
 from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.shape.pca_fit import fit_pca, training_codes
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -119,6 +119,7 @@ class KernelPCAShapePrior(nn.Module):
     def coefficients(self, code: Tensor) -> tuple[Tensor, Tensor]:
         """Coordinates c (B, M) in the subspace for codes (B, K), and `J_c_code` (B, M, K)."""
         check_shape("code", code, ("B", self.num_codes))
+        check_alike("code", code, "the prior", self.anchors)
         difference = code[:, None] - self.anchors  # (B, N, K)
         kernel = torch.exp(-0.5 * (difference * difference).sum(-1) / self.kernel_width**2)
         c = self.offset + code @ self.linear.T + kernel @ self.weights

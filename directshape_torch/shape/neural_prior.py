@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from directshape_torch.errors import InputError, shown
-from directshape_torch.numerics.checks import check_shape
+from directshape_torch.numerics.checks import check_alike, check_shape
 from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.shape.prior_file import PriorProvenance, read_prior, write_prior
@@ -122,6 +122,7 @@ class NeuralShapePrior(nn.Module):
     def bind(self, code: Tensor) -> NeuralShape:
         """The fields of B objects with codes (B, K)."""
         check_shape("code", code, ("B", self.num_codes))
+        check_alike("code", code, "the prior", self.origin)
         layers = self.coded_layers()
         return NeuralShape(
             [layer.weight for layer in layers],
@@ -142,6 +143,7 @@ class NeuralShapePrior(nn.Module):
     def dimensions_and_derivative(self, code: Tensor) -> DimensionsDerivative:
         """Height, width and length (B, 3), metres: a quadratic of the code, fitted to the training cars."""
         check_shape("code", code, ("B", self.num_codes))
+        check_alike("code", code, "the prior", self.origin)
         quadratic = self.dimensions_quadratic_hwl
         by_code = torch.einsum("dkl,bl->bdk", quadratic + quadratic.transpose(1, 2), code)
         hwl = self.dimensions_mean_hwl + code @ self.dimensions_linear_hwl.T + 0.5 * (by_code @ code[..., None])[..., 0]

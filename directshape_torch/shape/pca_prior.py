@@ -109,6 +109,7 @@ class PCAShapePrior(nn.Module):
     def values(self, code: Tensor) -> Tensor:
         """Signed distance at the nodes, (B, nx, ny, nz), metres, for codes (B, K)."""
         check_shape("code", code, ("B", self.num_codes))
+        check_alike("code", code, "the prior", self.mean)
         flat = torch.addmm(self.mean.reshape(1, -1), code, self.basis.reshape(-1, self.num_codes).T)
         return flat.reshape(-1, *self.mean.shape)
 
@@ -120,6 +121,7 @@ class PCAShapePrior(nn.Module):
     def dimensions_and_derivative(self, code: Tensor) -> DimensionsDerivative:
         """Height, width and length (B, 3), metres, by the linear map of the training cars, and its derivative."""
         check_shape("code", code, ("B", self.num_codes))
+        check_alike("code", code, "the prior", self.mean)
         hwl = self.dimensions_mean_hwl + code @ self.dimensions_basis_hwl.T
         return DimensionsDerivative(hwl, self.dimensions_basis_hwl.expand(len(code), -1, -1))
 

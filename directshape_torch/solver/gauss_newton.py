@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig, StageConfig
+from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.solver.iteration import RUNNING, IterationOutcome, begin, has_failed, iterate, step_lengths
 from directshape_torch.solver.problem import (
     BegunStage,
@@ -111,6 +112,7 @@ class _Unfailed:
     numbers: list[int]
 
 
+@full_precision()
 def minimise(
     problem: Problem[StateT],
     initial: StateT,
@@ -221,6 +223,7 @@ def _read(ended: Tensor) -> list[int]:
     return codes
 
 
+@full_precision()
 def search_start(
     problem: Problem[StateT], initial: StateT, rounds: Sequence[Sequence[Callable[[StateT], StateT]]]
 ) -> StateT:

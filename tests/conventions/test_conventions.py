@@ -363,3 +363,4 @@ def test_27_results_follow_the_inputs(dtype: torch.dtype) -> None:
     assert result.T_cam_obj.dtype == result.code.dtype == result.boxes().location_ref.dtype == dtype
     assert result.T_cam_obj.device == scene.detections.T_cam_obj.device
     assert result.refined.all()
+    assert box3d.wrap_angle(torch.ones(1).bfloat16()).dtype == torch.float32
