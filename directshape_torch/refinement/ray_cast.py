@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.rows import Rays
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -22,6 +23,7 @@ class RayCast(NamedTuple):
 
 
 @torch.no_grad()
+@full_precision()
 def cast(
     prior: ShapePrior,
     state: CarState,  # of one car
