@@ -14,6 +14,7 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import check_shape
+from directshape_torch.numerics.conversion import Given, as_tensor
 from directshape_torch.numerics.records import Dense, TensorRecord
 
 MASK_THRESHOLD = 0.5
@@ -59,7 +60,7 @@ class MaskCrops(TensorRecord):
             raise InputError("boxes", expected, str(self._boxes), "make crops with MaskCrops.of")
 
     @classmethod
-    def of(cls, masks: Masks, present: Tensor | None = None, name: str = "masks") -> Self:
+    def of(cls, masks: Masks, present: Given | None = None, name: str = "masks") -> Self:
         """Crops of masks as users have them.
 
         Args:
@@ -73,11 +74,12 @@ class MaskCrops(TensorRecord):
             InputError: no masks of one size, another dtype, or values above 1.5.
         """
         if isinstance(masks, cls):
-            return masks if present is None else masks.where(present)
-        masks = _as_tensor(masks)
+            return masks if present is None else masks.where(as_tensor(present))
+        masks = masks if isinstance(masks, (list, tuple)) else as_tensor(masks)
         entries = _entries(name, masks)
         exists = [True] * len(entries)
         if present is not None:
+            present = as_tensor(present)
             check_shape(f"has_{name}", present, (len(entries),), kind="flags")
             exists = present.tolist()
         used = [mask if here else None for mask, here in zip(entries, exists, strict=True)]
@@ -240,11 +242,6 @@ def _first_and_end(
     return torch.where(first == beyond, 0, first), end
 
 
-def _as_tensor(value: Any) -> Any:
-    """A tensor in place of a numpy array, whose steps may go backwards; other values as they are."""
-    return torch.as_tensor(np.ascontiguousarray(value)) if isinstance(value, np.ndarray) else value
-
-
 def _entries(name: str, masks: Masks) -> list[Tensor | None]:
     """Each mask (H, W) in bool or floating point, or None."""
     if isinstance(masks, Tensor):
@@ -258,7 +255,7 @@ def _entries(name: str, masks: Masks) -> list[Tensor | None]:
         if mask is None:
             entries.append(None)
             continue
-        tensor = _as_tensor(mask)
+        tensor = as_tensor(mask)
         check_shape(f"{name}[{row}]", tensor, ("H", "W"))
         entries.append(_foreground(f"{name}[{row}]", tensor))
     sizes = {tuple(mask.shape) for mask in entries if mask is not None}

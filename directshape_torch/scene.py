@@ -105,7 +105,7 @@ class FrameBatch(TensorRecord):
         images_left: Given,  # (F, 3, H, W), or (3, H, W) of one frame
         images_right: Given,
         camera: StereoCamera,
-        ground: GroundPlane | float = 1.65,
+        ground: GroundPlane | float | Given = 1.65,
         frame_ids: Sequence[str] | None = None,
         time_s: Given | None = None,
         T_world_cam: Given | None = None,
@@ -317,11 +317,11 @@ class Detections(TensorRecord):
         )
         _check_mask_numbers(left, right, count)
         return cls(
-            frame_index=as_index([0] * count if frame_index is None else frame_index, like),
+            frame_index=as_index(like.new_zeros(count, dtype=torch.long) if frame_index is None else frame_index, like),
             T_cam_obj=T_cam_obj,
             dimensions_hwl=dimensions_hwl,
             box_2d=as_floating(left.box_2d if box_2d is None else box_2d, like),
-            score=as_floating([1] * count if score is None else score, like),
+            score=as_floating(like.new_ones(count) if score is None else score, like),
             mask_left=left,
             mask_right=right,
             occluders=occluders,

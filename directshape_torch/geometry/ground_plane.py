@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.numerics.checks import check_positive, check_rows, check_words
-from directshape_torch.numerics.conversion import as_number, working_dtype
+from directshape_torch.numerics.conversion import Given, as_number, working_dtype
 from directshape_torch.numerics.records import Dense, TensorRecord
 
 
@@ -39,7 +39,7 @@ class GroundPlane(TensorRecord):
             check_rows("normal", not_unit, self.normal, "unit length", "divide the plane by its length")
 
     @classmethod
-    def from_camera_height(cls, height_m: float, num_frames: int = 1) -> GroundPlane:
+    def from_camera_height(cls, height_m: float | Given, num_frames: int = 1) -> GroundPlane:
         """A level ground `height_m` below the camera, for rigs without plane files.
 
         The plane is float32, or float64 where that is PyTorch's default; `FrameBatch.from_images` takes it to the
@@ -52,9 +52,9 @@ class GroundPlane(TensorRecord):
             >>> GroundPlane.from_camera_height(1.65).offset
             tensor([1.6500])
         """
-        height_m = as_number(height_m)
-        check_positive("height_m", height_m, "give the camera's height above the road, in metres")
+        height = as_number(height_m)
+        check_positive("height_m", height, "give the camera's height above the road, in metres")
         dtype = working_dtype(torch.get_default_dtype())
         normal = torch.tensor([[0.0, -1.0, 0.0]], dtype=dtype).repeat(num_frames, 1)
-        offset = torch.full((num_frames,), float(height_m), dtype=dtype)
+        offset = torch.full((num_frames,), float(height), dtype=dtype)
         return cls(normal, offset, ("camera_height",) * num_frames)

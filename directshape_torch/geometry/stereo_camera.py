@@ -101,7 +101,7 @@ class StereoCamera(TensorRecord):
         if len(of_right) not in (1, len(K_left)):
             expected, cure = f"one matrix, or {len(K_left)} as K has", "give one K_right for all frames or one for each"
             raise InputError("K_right", expected, f"{len(of_right)}", cure)
-        if isinstance(baseline_m, (Tensor, np.ndarray)):
+        if isinstance(baseline_m, (Tensor, np.ndarray, list, tuple)):
             baseline_m = as_floating(baseline_m, K_left)
             check_shape("baseline_m", baseline_m, (len(K_left),) if baseline_m.ndim else (), kind="floating")
         else:

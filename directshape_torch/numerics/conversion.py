@@ -16,8 +16,7 @@ from torch import Tensor
 Given = Tensor | NDArray[Any] | Sequence[Any]
 """Numbers in a tensor, an array or a list."""
 
-HALF = (torch.float16, torch.bfloat16)
-FLOATING = (torch.float32, torch.float64, *HALF)
+FLOATING = (torch.float32, torch.float64, torch.float16, torch.bfloat16)
 _WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32, torch.uint64)
 
 
