@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, Self, Union
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor

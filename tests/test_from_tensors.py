@@ -96,7 +96,10 @@ def test_projections_of_one_frame_and_their_mistakes() -> None:
 
 def same(a: TensorRecord, b: TensorRecord) -> bool:
     pairs = zip(a.tensors(""), b.tensors(""), strict=True)
-    return all(x.value.dtype == y.value.dtype and x.value.equal(y.value) for x, y in pairs)
+    return all(
+        x.value.dtype == y.value.dtype and torch.allclose(x.value, y.value, rtol=0, atol=0, equal_nan=True)
+        for x, y in pairs
+    )
 
 
 MOTION = torch.eye(4)

@@ -287,6 +287,7 @@ CASES: dict[str, Case] = {
         box_formats.poses_to_boxes(n.T, n.hwl, "opencv"),
         box_formats.poses_to_boxes(n.T, n.hwl, "nuscenes", n.T_cam_lidar),
     ],
+    "image_boxes.box_outlines": lambda n: [*image_boxes.box_outlines(n.T, n.hwl, camera(n))],
     "image_boxes.project_boxes": lambda n: image_boxes.project_boxes(n.T, n.hwl, camera(n), (120, 160)),
     "disparity_field.polynomial_basis": lambda n: disparity_field.polynomial_basis(n.uv, (160, 120)),
     "disparity_field.nearest_in_convex_polygon": lambda n: disparity_field.nearest_in_convex_polygon(
@@ -357,6 +358,11 @@ CASES: dict[str, Case] = {
 
 # These compute nothing from tensors, or are what another one here calls.
 WITHOUT_NUMBERS = {
+    "BoxForm.order", "BoxForm.place", "Detections.has_mask_left", "Detections.has_mask_right",
+    "Detections.telling_rows", "MaskCrops.areas", "MaskCrops.at", "MaskCrops.box_2d", "MaskCrops.crop",
+    "MaskCrops.dense", "MaskCrops.extents", "MaskCrops.joined", "MaskCrops.none", "MaskCrops.of", "MaskCrops.of_boxes",
+    "MaskCrops.padded", "MaskCrops.rows", "MaskCrops.where", "box_formats.box_form", "box_formats.check_upright",
+    "image_boxes.enclosing_boxes",
     "CheckReport.count", "CheckReport.exit_code", "DisparityField.check_rig", "DisparityField.rig", "DisparityField.to",
     "Finding.block", "GridShape.field", "KernelPCAShapePrior.load", "KernelPCAShapePrior.num_codes",
     "KernelPCAShapePrior.origin", "KernelPCAShapePrior.provenance", "KernelPCAShapePrior.save",
