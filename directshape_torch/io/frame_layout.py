@@ -203,4 +203,4 @@ def image_stems(folder: Path) -> list[str]:
 
 
 def _is_json(path: Path) -> bool:
-    return path.suffix == ".json"
+    return path.suffix.lower() == ".json"

@@ -220,7 +220,7 @@ def odometry_layout(root: Path | str, detections_dir: Path | str) -> Layout:
         whole = root.resolve()
         return Layout({whole.name: (whole.parents[1], ODOMETRY)}, detections_dir)
     for base in (root, root / "dataset"):
-        names = sorted(path.parent.name for path in base.glob("sequences/*/image_2"))
+        names = sorted(path.parent.name for path in base.glob("sequences/[!.]*/image_2"))
         if names:
             return Layout(dict.fromkeys(names, (base, ODOMETRY)), detections_dir, single=False)
     raise DataFormatError(
@@ -250,7 +250,7 @@ def tracking_layout(root: Path | str, detections_dir: Path | str) -> Layout:
     if image_stems(root / "image_02"):
         return Layout({root.resolve().name: (root, TRACKING_SEQUENCE)}, detections_dir)
     base = _split_with(root, "image_02") or root
-    names = sorted(path.name for path in (base / "image_02").glob("*") if path.is_dir())
+    names = sorted(path.name for path in (base / "image_02").glob("[!.]*") if path.is_dir())
     if not names:
         raise DataFormatError(
             root,
@@ -266,7 +266,7 @@ def raw_layout(root: Path | str, detections_dir: Path | str) -> Layout:
     """
     root = Path(root)
     single = (root / "image_02" / "data").is_dir()
-    found = {path.parents[1] for depth in ("*", "*/*") for path in root.glob(f"{depth}/image_02/data")}
+    found = {path.parents[1] for depth in ("[!.]*", "[!.]*/[!.]*") for path in root.glob(f"{depth}/image_02/data")}
     drives = [root] if single else sorted(found)
     if not drives:
         raise DataFormatError(

@@ -152,7 +152,7 @@ def open_dataset(
     if isinstance(masks, (str, Path)):
         is_text = Path(masks).is_file() and Path(masks).suffix.lower() == ".txt"
         masks = LayoutMasks(layout, Path(masks) if is_text else existing_folder(Path(masks), "is no folder of masks"))
-    elif masks is None and first.detections.suffix == ".json":
+    elif masks is None and first.detections.suffix.lower() == ".json":
         masks = LayoutMasks(layout, None)
     return StereoDataset(
         layout,

@@ -38,7 +38,7 @@ def read_points(path: Path | str) -> NDArray[np.float64]:
 
     KITTI's `.bin` is little-endian float32, four a point: x, y, z, reflectance; `.npy` is an array (P, 3 or more).
     """
-    if Path(path).suffix == ".npy":
+    if Path(path).suffix.lower() == ".npy":
         points = read_npy(path)
         if points.ndim != 2 or points.shape[1] < 3 or not len(points) or points.dtype.kind not in "fiu":
             got = f"{points.dtype} of shape {points.shape}"

@@ -7,6 +7,7 @@ import unicodedata
 from pathlib import Path
 
 import pytest
+from helpers.layouts import write_folder
 
 from directshape_torch.io.stereo_dataset import StereoDataset, open_dataset
 
@@ -87,3 +88,15 @@ def test_links_to_files_and_folders_are_followed(kitti_copy: Path, tmp_path: Pat
     image.rename(tmp_path / "elsewhere.png")
     image.symlink_to(tmp_path / "elsewhere.png")
     assert cars(opened(link)) == expected
+
+
+def test_a_plain_folder_with_endings_in_capitals(kitti_copy: Path, tmp_path: Path) -> None:
+    write_folder(kitti_copy, tmp_path, opened(kitti_copy).frame_ids)
+    expected = cars(open_dataset("folder", tmp_path))
+    for path in list((tmp_path / "frames").iterdir()):
+        path.rename(path.with_suffix(".JSON"))
+        (path.parent / f"._{path.name}").write_bytes(b"\x00\x05\x16\x07")
+    (tmp_path / "rig.json").rename(tmp_path / "rig.JSON")
+    dataset = open_dataset("folder", tmp_path)
+    assert cars(dataset) == expected
+    assert dataset.load(dataset.frame_ids[0]).detections.has_mask_left.any()
