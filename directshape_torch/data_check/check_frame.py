@@ -15,7 +15,7 @@ from directshape_torch.errors import DataFormatError, DirectShapeError
 from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_layout import FrameFiles
-from directshape_torch.io.image_files import as_pair, read_rgb
+from directshape_torch.io.image_files import as_pair, read_colours
 from directshape_torch.io.instance_masks import InstanceMask, MaskSizeError
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
@@ -30,6 +30,7 @@ from directshape_torch.scene_check.check_images import (
     check_images,
     without_doubts,
 )
+from directshape_torch.scene_check.check_tones import check_tones
 from directshape_torch.scene_check.finding import Finding, names, unreadable
 from directshape_torch.scene_check.words import Words, words_of_files
 
@@ -83,6 +84,7 @@ def check_frame(dataset: StereoDataset, frame_id: str) -> tuple[list[Finding], i
     # A wrong calibration must not spoil what the images say by themselves.
     camera = None if names(findings) & SPOILS_CAMERA else camera
     if pair is not None:
+        findings += check_tones(*pair, attempt.where)
         of_pair = check_images(*pair, camera, attempt.where)
         findings = [*without_doubts(findings, of_pair), *of_pair]
     cars = [o for o in objects or [] if o.type in dataset.classes and o.has_box_3d]
@@ -93,8 +95,8 @@ def check_frame(dataset: StereoDataset, frame_id: str) -> tuple[list[Finding], i
 
 
 def _read_pair(files: FrameFiles, attempt: _Attempts) -> Pair | None:
-    left = attempt("left_image", "a whole PNG or JPEG", partial(read_rgb, files.left))
-    right = attempt("right_image", "a whole PNG or JPEG", partial(read_rgb, files.right))
+    left = attempt("left_image", "a whole PNG or JPEG", partial(read_colours, files.left))
+    right = attempt("right_image", "a whole PNG or JPEG", partial(read_colours, files.right))
     if left is None or right is None:
         return None
     return attempt("image_size", "one size", partial(as_pair, left, right, files.right))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,29 +31,50 @@ IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
 
 
 def read_rgb(path: Path | str) -> NDArray[np.uint8]:
-    """Read a PNG or JPEG file as RGB, uint8 (H, W, 3)."""
+    """Read a PNG or JPEG file as RGB, uint8 (H, W, 3); see `as_pair` for images of more than 8 bits."""
+    (rgb,) = _in_bytes([read_colours(path)])
+    return rgb
+
+
+def read_colours(path: Path | str) -> NDArray[Any]:
+    """Read a PNG or JPEG file as RGB, uint8 or uint16 (H, W, 3), as it is stored."""
     import cv2
 
-    bgr = _decode(path, cv2.IMREAD_COLOR)
+    bgr = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     return np.ascontiguousarray(bgr[..., ::-1])
 
 
 def read_pair(left_path: Path, right_path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Both images of a rectified pair, see `read_rgb`."""
-    return as_pair(read_rgb(left_path), read_rgb(right_path), right_path)
+    """Both images of a rectified pair as RGB, uint8 (H, W, 3), see `as_pair`."""
+    return as_pair(read_colours(left_path), read_colours(right_path), right_path)
 
 
-def as_pair(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], right_path: Path
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Both images, unless they differ in size."""
+def _in_bytes(images: Sequence[NDArray[Any]]) -> list[NDArray[np.uint8]]:
+    """Images in 8 bits; those of 16 are scaled alike, by the bits that they use: cameras have 10, 12 and 14, too."""
+    if all(image.dtype == np.uint8 for image in images):
+        return list(images)
+    highest = max(int(image.max()) for image in images if image.dtype != np.uint8)
+    bits = next(bits for bits in (8, 10, 12, 14, 16) if highest < 2**bits)
+    scale = np.float32(255 / (2**bits - 1))
+    return [
+        image if image.dtype == np.uint8 else np.rint(image.astype(np.float32) * scale).astype(np.uint8)
+        for image in images
+    ]
+
+
+def as_pair(left: NDArray[Any], right: NDArray[Any], right_path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Both images as uint8, unless they differ in size.
+
+    Images of 16 bits may hold fewer: numbers below 4096 are those of a camera of 12 bits. Both sides are scaled alike.
+    """
     if left.shape != right.shape:
         raise DataFormatError(
             right_path,
             f"has {right.shape[1]} x {right.shape[0]} pixels, the left image {left.shape[1]} x {left.shape[0]}",
             cure="give the rectified pair of one frame",
         )
-    return left, right
+    in_bytes = _in_bytes([left, right])
+    return in_bytes[0], in_bytes[1]
 
 
 def read_single_channel(path: Path | str) -> NDArray[Any]:

@@ -20,6 +20,7 @@ from directshape_torch.scene_check.check_images import (
 )
 from directshape_torch.scene_check.check_masks import check_masks
 from directshape_torch.scene_check.check_places import check_distances, check_heading, check_swapped, measure_cars
+from directshape_torch.scene_check.check_tones import check_tones
 from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, names
 from directshape_torch.scene_check.finding import found as found_mistake
 from directshape_torch.scene_check.words import Words
@@ -70,6 +71,8 @@ def check_scene(
     found = _once([finding for one in evidence for finding in _check_camera(one)])
     usable = not names(found) & SPOILS_CAMERA
     for one in evidence:
+        if one.pair is not None:
+            found += check_tones(*one.pair, f"frame {one.frame_id}")
         if match_images and one.pair is not None:
             of_pair = check_images(*one.pair, one.camera if usable else None, f"frame {one.frame_id}")
             found = [*without_doubts(found, of_pair), *of_pair]

@@ -167,6 +167,9 @@ MISTAKES: dict[str, Mistake] = {
     "few_matches": Mistake(
         "note", "at least {limit}", "nothing, where the images have little texture; the pair was not checked"
     ),
+    "grey_levels": Mistake(
+        "warning", "photographs of 0 to 255, alike on both sides", "expose and convert both cameras alike"
+    ),
     "mask_size": Mistake(
         "error",
         "masks of the size of their image",

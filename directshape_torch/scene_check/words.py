@@ -64,7 +64,7 @@ _UNITS_IN_FILES = Says("{low} to {high} m", "write metres (for larger vehicles u
 
 def words_of_files(calibration: Path, names: tuple[str, str] = ("P2", "P3")) -> Words:
     """Of a data set, by its calibration file and the names of the two cameras in it."""
-    return _words_of_folder() if calibration.suffix == ".json" else _words_of_kitti(*names)
+    return _words_of_folder() if calibration.suffix.lower() == ".json" else _words_of_kitti(*names)
 
 
 def _words_of_kitti(left: str, right: str) -> Words:

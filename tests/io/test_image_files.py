@@ -11,7 +11,7 @@ from helpers.disparity_maps import write_disparity
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_png
-from directshape_torch.io.image_files import find_image, read_disparity, read_rgb, read_single_channel
+from directshape_torch.io.image_files import find_image, read_disparity, read_pair, read_rgb, read_single_channel
 
 
 @pytest.fixture
@@ -48,6 +48,21 @@ def test_truncated_jpeg_and_whole_one(tmp_path: Path) -> None:
             read_rgb(path)
     with pytest.raises(DataFormatError, match=r"000003\.png: cannot be read \(No such file"):
         read_rgb(find_image(tmp_path, "000003"))
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+def test_images_of_16_bits_may_hold_fewer(tmp_path: Path, bits: int) -> None:
+    """Both sides are scaled alike, by the bits that the brighter one uses."""
+    rng = np.random.default_rng(0)
+    left = rng.integers(0, 2**bits, (20, 30, 3), np.uint16)
+    left[0, 0] = 2**bits - 1
+    right = left // 5
+    for name, image in (("left", left), ("right", right)):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), image[..., ::-1])
+    found = read_pair(tmp_path / "left.png", tmp_path / "right.png")
+    for image, stored in zip(found, (left, right), strict=True):
+        assert image.dtype == np.uint8
+        np.testing.assert_allclose(image, stored * (255 / (2**bits - 1)), atol=0.501)
 
 
 def test_colour_image_where_ids_are_expected(png: Path) -> None:
