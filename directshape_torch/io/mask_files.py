@@ -33,6 +33,9 @@ COCO_CAR_IDS = frozenset({3})
 PNG_CAR_IDS = frozenset({1, 26})
 _MOTS_IGNORE_CLASS = 10
 _IDS_PER_CLASS = 1000
+# The instance files of KITTI's semantic benchmark have Cityscapes' classes, of which 24 to 33 have instances.
+_IDS_PER_SEMANTIC_CLASS, _HIGHEST_CLASS, _FIRST_THING = 256, 33, 24
+_KNOWN_CLASSES = frozenset({0, 1, 2, _MOTS_IGNORE_CLASS, *range(_FIRST_THING, _HIGHEST_CLASS + 1)})
 _TRACKING_FOLDERS = ("instance_02", "instance_03")
 # With its place in its file.
 _Entry = tuple[int, Mapping[str, Any]]
@@ -79,7 +82,9 @@ class FrameJsonMasks:
 class InstancePngMasks:
     """Folders `instance_2` (left) and `instance_3` (right, if any) of PNG files with `class * 1000 + instance`.
 
-    KITTI MOTS (1 car, 2 pedestrian, 10000 ignored) and Cityscapes (26 car; values below 1000 are not instances).
+    KITTI MOTS (1 car, 2 pedestrian, 10000 ignored) and Cityscapes (26 car; values below 1000 are not instances). The
+    files `instance` of KITTI's semantic benchmark, `class * 256 + instance` with Cityscapes' classes, are known by
+    their numbers.
     """
 
     directory: Path  # the folder that holds both, or the left one alone
@@ -93,7 +98,7 @@ class InstancePngMasks:
         for side, path in zip(SIDES, self.files(frame_id), strict=False):
             ids = read_single_channel(path)
             check_size(path, "the instance image", ids.shape, size_hw)
-            masks += within_memory(path, self._instances(side, ids))
+            masks += within_memory(path, self._instances(path, side, ids))
         return masks
 
     def files(self, frame_id: str) -> tuple[Path, ...]:
@@ -104,13 +109,28 @@ class InstancePngMasks:
         """The file without which there are no masks of a frame."""
         return self.files(frame_id)[0]
 
-    def _instances(self, side: Side, ids: NDArray[Any]) -> Iterable[InstanceMask | None]:
-        for value in np.unique(ids).tolist():
-            category = value // _IDS_PER_CLASS
-            if category in (0, _MOTS_IGNORE_CLASS):
+    def _instances(self, path: Path, side: Side, ids: NDArray[Any]) -> Iterable[InstanceMask | None]:
+        values = np.unique(ids).tolist()
+        if ids.dtype == np.uint8 and values[-1]:
+            problem = f"has 8 bits and numbers up to {values[-1]}, where class * 1000 + instance does not fit"
+            raise DataFormatError(path, problem, cure="write 16 bits: 1000 * class + instance, car 1 or 26")
+        per_class = _ids_per_class(values)
+        for value in values:
+            category, number = divmod(value, per_class)
+            is_stuff = per_class == _IDS_PER_SEMANTIC_CLASS and (category < _FIRST_THING or not number)
+            if is_stuff or category in (0, _MOTS_IGNORE_CLASS):
                 continue
-            track = value % _IDS_PER_CLASS if self.folders == _TRACKING_FOLDERS else -1
+            track = number if self.folders == _TRACKING_FOLDERS else -1
             yield InstanceMask.found(side, value, category in self.car_ids, ids == value, track_id=track)
+
+
+def _ids_per_class(values: Sequence[int]) -> int:
+    """By what classes are multiplied in an image of such numbers: 1000, or 256 where those fit and these do not."""
+    known = all(value // _IDS_PER_CLASS in _KNOWN_CLASSES for value in values)
+    semantic = [divmod(value, _IDS_PER_SEMANTIC_CLASS) for value in values]
+    fits = all(category <= _HIGHEST_CLASS for category, _ in semantic)
+    has_things = any(category >= _FIRST_THING and number for category, number in semantic)
+    return _IDS_PER_SEMANTIC_CLASS if not known and fits and has_things else _IDS_PER_CLASS
 
 
 @dataclass(frozen=True)

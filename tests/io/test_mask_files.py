@@ -187,6 +187,25 @@ def test_instance_png_of_mots_and_cityscapes(tmp_path: Path, car: int, other: in
     assert [mask.instance_id for mask in cars_of_another_class if mask.is_car] == [other]
 
 
+def test_instance_png_of_kittis_semantic_benchmark(tmp_path: Path) -> None:
+    """Road 7, pedestrian 24, car 26, all times 256; the road and what is no single instance are none."""
+    ids = np.full(SIZE_HW, 7 * 256, np.uint16)
+    ids[MASK] = 26 * 256 + 3
+    ids[5, :2], ids[0, 7:] = 24 * 256 + 1, 26 * 256
+    write_png(tmp_path / "instance_2" / "000000.png", ids)
+    found = {mask.instance_id: mask for mask in mask_source(tmp_path).read("000000", SIZE_HW)}
+    assert {number: mask.is_car for number, mask in found.items()} == {26 * 256 + 3: True, 24 * 256 + 1: False}
+    np.testing.assert_array_equal(found[26 * 256 + 3].whole(SIZE_HW), MASK)
+
+
+def test_instance_png_of_8_bits_is_refused_and_an_empty_one_is_not(tmp_path: Path) -> None:
+    write_png(tmp_path / "instance_2" / "000000.png", np.where(MASK, 3, 0).astype(np.uint8))
+    with pytest.raises(DataFormatError, match=r"has 8 bits and numbers up to 3, where class \* 1000 .*; write 16 bits"):
+        mask_source(tmp_path).read("000000", SIZE_HW)
+    write_png(tmp_path / "instance_2" / "000001.png", np.zeros(SIZE_HW, np.uint8))
+    assert mask_source(tmp_path).read("000001", SIZE_HW) == []
+
+
 def test_instance_png_of_the_left_images_alone(tmp_path: Path) -> None:
     write_png(tmp_path / "instance_2" / "000000.png", np.full(SIZE_HW, 1001, np.uint16))
     source = mask_source(tmp_path)
