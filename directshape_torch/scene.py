@@ -42,7 +42,8 @@ _BRIGHTEST = 1.5
 _DARKEST = -0.5
 # What times and places of a path must be told apart by.
 _FINE_S, _FINE_M = 1e-3, 0.01
-_MOST_TELLING = 100
+MOST_TELLING = 100
+"""Cars of a frame that checks and rigs look at."""
 
 
 @dataclass(frozen=True)
@@ -348,7 +349,7 @@ class Detections(TensorRecord):
         """
         has_mask, score, of_frame = self.has_mask_left.tolist(), self.score.tolist(), self.frame_index.tolist()
         rows = [row for row, number in enumerate(of_frame) if number == frame]
-        return sorted(sorted(rows, key=lambda row: (not has_mask[row], -score[row]))[:_MOST_TELLING])
+        return sorted(sorted(rows, key=lambda row: (not has_mask[row], -score[row]))[:MOST_TELLING])
 
     def __len__(self) -> int:
         return len(self.frame_index)

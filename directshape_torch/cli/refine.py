@@ -27,15 +27,14 @@ from directshape_torch.cli.options import (
 )
 from directshape_torch.cli.progress import Bar, ProgressBar
 from directshape_torch.config import RefinerConfig
-from directshape_torch.errors import DirectShapeError, InputError
+from directshape_torch.data_check.check_dataset import check_frames
+from directshape_torch.errors import InputError
 from directshape_torch.files.atomic_files import write_png
-from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.rig.estimate import RigEstimate, RigEstimates
 from directshape_torch.rig.from_files import estimate_rigs
 from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, known_rigs, load_rigs, save_rigs
-from directshape_torch.scene_check.check_scene import check_scene
-from directshape_torch.scene_check.words import words_of_files
+from directshape_torch.scene_check.finding import SAID_BY_THE_RUN, by_severity
 from directshape_torch.terms.lidar import LidarPoints
 from directshape_torch.visualize.rig_picture import draw_rigs
 
@@ -133,13 +132,11 @@ def _warned_of(dataset: StereoDataset, config: RefinerConfig) -> RefinerConfig:
     """Print what the first frames show to be wrong; settings with which calls do not look again."""
     if config.check == "off":
         return config
-    try:
-        frames, detections = collate([dataset.load(frame_id) for frame_id in dataset.frame_ids[:_CHECKED_FRAMES]])
-    except (DirectShapeError, OSError):  # the run says which frame cannot be read, and goes on with the others
-        return config
-    words = words_of_files(dataset.layout.files(dataset.frame_ids[0]).calibration)
-    for finding in check_scene(frames, detections, match_images=False, words=words).findings:
-        print(f"check: {finding} ('directshape check-data' looks closer)", file=sys.stderr)
+    findings, _ = check_frames(dataset, dataset.frame_ids[:_CHECKED_FRAMES], match_images=False)
+    for finding in by_severity(findings):
+        # Which frame cannot be read, or has no cars, the run says itself, and goes on with the others.
+        if finding.check not in SAID_BY_THE_RUN:
+            print(f"check: {finding} ('directshape check-data' looks closer)", file=sys.stderr)
     return replace(config, check="off")
 
 

@@ -45,27 +45,40 @@ def check_dataset(
     if max_frames is not None and max_frames < 1:
         raise InputError("max_frames", "at least 1", str(max_frames))
     chosen = spread(dataset.frame_ids, max_frames)
-    findings = check_files(dataset)
+    findings, num_cars = check_frames(dataset, chosen, tell)
+    findings = [*check_files(dataset), *findings]
+    # Of boxes or images that are wrong an estimate would only say the same again.
+    if not any(finding.severity == "error" for finding in findings):
+        findings += check_rig(dataset, chosen)
+    return CheckReport(by_severity(findings), len(dataset), len(chosen), num_cars)
+
+
+def check_frames(
+    dataset: StereoDataset,
+    frame_ids: Sequence[str],
+    tell: Callable[[str], object] = lambda _: None,
+    match_images: bool = True,
+) -> tuple[list[Finding], int]:
+    """What some frames show one by one and together, and the number of their cars.
+
+    Args:
+        dataset, tell: as in `check_dataset`.
+        frame_ids: the frames.
+        match_images: whether features of both images are matched, which takes most of the time.
+    """
+    findings: list[Finding] = []
     evidence: list[FrameEvidence] = []
     num_cars = 0
-    for frame_id in chosen:
-        of_frame, count, of_its_cars = check_frame(dataset, frame_id)
+    for frame_id in frame_ids:
+        of_frame, count, of_its_cars = check_frame(dataset, frame_id, match_images)
         findings += of_frame
         evidence += [] if of_its_cars is None else [of_its_cars]
         num_cars += count
         tell(frame_id)
-    nothing = found(
-        "no_cars",
-        "all frames",
-        "no detection of the chosen classes with a 3D box",
-        words=words_of_files(dataset.layout.files(dataset.frame_ids[0]).calibration),
-    )
-    of_cars = check_cars(evidence) if num_cars else [nothing]
-    # Of boxes or images that are wrong an estimate would only say the same again.
-    if not any(finding.severity == "error" for finding in (*findings, *of_cars)):
-        of_cars += check_rig(dataset, chosen)
-    findings += of_cars
-    return CheckReport(by_severity(findings), len(dataset), len(chosen), num_cars)
+    words = words_of_files(dataset.layout.files(dataset.frame_ids[0]).calibration)
+    nothing = "no detection of the chosen classes with a 3D box"
+    of_cars = check_cars(evidence) if num_cars else [found("no_cars", "all frames", nothing, words=words)]
+    return [*findings, *of_cars], num_cars
 
 
 def spread(frame_ids: Sequence[str], count: int | None) -> tuple[str, ...]:

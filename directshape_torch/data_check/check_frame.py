@@ -21,8 +21,8 @@ from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_c
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.mask_matching import MIN_OVERLAP, assign
 from directshape_torch.io.stereo_dataset import StereoDataset
-from directshape_torch.scene import SIDES
-from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence, Pair
+from directshape_torch.scene import MOST_TELLING, SIDES
+from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence, Pair, reread_boxes
 from directshape_torch.scene_check.check_images import (
     SPOILS_CAMERA,
     SPOILS_PAIR,
@@ -57,9 +57,11 @@ class _Attempts:
             return None
 
 
-def check_frame(dataset: StereoDataset, frame_id: str) -> tuple[list[Finding], int, FrameEvidence | None]:
+def check_frame(
+    dataset: StereoDataset, frame_id: str, match_images: bool = True
+) -> tuple[list[Finding], int, FrameEvidence | None]:
     """All findings about a frame, the number of its cars, and what it shows of them, None where its images or its
-    calibration are wrong."""
+    calibration are wrong. Its two images are matched by their features only where that is asked for."""
     files, attempt = dataset.layout.files(frame_id), _Attempts(f"frame {frame_id}")
     words = words_of_files(files.calibration)
     pair = _read_pair(files, attempt)
@@ -85,7 +87,7 @@ def check_frame(dataset: StereoDataset, frame_id: str) -> tuple[list[Finding], i
     camera = None if names(findings) & SPOILS_CAMERA else camera
     if pair is not None:
         findings += check_tones(*pair, attempt.where)
-        of_pair = check_images(*pair, camera, attempt.where)
+        of_pair = check_images(*pair, camera, attempt.where) if match_images else []
         findings = [*without_doubts(findings, of_pair), *of_pair]
     cars = [o for o in objects or [] if o.type in dataset.classes and o.has_box_3d]
     if camera is None or size_hw is None:
@@ -133,26 +135,34 @@ def _evidence(
     around = {side: _columns([mask.mask_box for mask in of_side], 4) for side, of_side in of_cars.items()}
     overlap = {side: np.nan_to_num(box_iou(boxes.box_2d, around[side])) for side in SIDES}
     matches = {side: assign(np.where(each >= MIN_OVERLAP, each, 0.0)) for side, each in overlap.items()}
-    own = {side: [None if k < 0 else of_cars[side][k] for k in matches[side]] for side in SIDES}
+    rows = _telling(cars, matches["left"])
+    own = {side: [None if (k := matches[side][row]) < 0 else of_cars[side][k] for row in rows] for side in SIDES}
     nothing = (np.nan,) * 4
     return FrameEvidence(
         frame_id=frame_id,
-        boxes=boxes,
+        boxes=boxes.chosen(rows),
         mask_boxes={
             side: _columns([nothing if mask is None else mask.mask_box for mask in own[side]], 4) for side in SIDES
         },
         overlap={
-            side: np.array([overlap[side][row, k] if k >= 0 else 0.0 for row, k in enumerate(matches[side])])
+            side: np.array([overlap[side][row, k] if (k := matches[side][row]) >= 0 else 0.0 for row in rows])
             for side in SIDES
         },
         num_masks={side: len(of_cars[side]) for side in SIDES},
-        seen=(around["left"],) * len(boxes),
+        seen=(around["left"],) * len(rows),
         masks=tuple(None if mask is None else mask.whole(size_hw) for mask in own["left"]),
+        reread=reread_boxes(mask.whole(size_hw) for mask in of_cars["left"]),
         camera=camera,
         size_hw=size_hw,
         has_masks=masks is not None,
         words=words,
     )
+
+
+def _telling(cars: Sequence[KittiObject], masks_left: Sequence[int]) -> list[int]:
+    """The cars that tell most, as `Detections.telling_rows` chooses them."""
+    order = sorted(range(len(cars)), key=lambda row: (masks_left[row] < 0, -(cars[row].score or 0.0)))
+    return sorted(order[:MOST_TELLING])
 
 
 def _columns(rows: Sequence[tuple[float, ...]], count: int) -> NDArray[np.float64]:

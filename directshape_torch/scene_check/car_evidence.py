@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -33,6 +34,10 @@ class CarBoxes:
     def __len__(self) -> int:
         return len(self.location)
 
+    def chosen(self, rows: Sequence[int]) -> CarBoxes:
+        """Some of the boxes, in that order."""
+        return CarBoxes(*(values[rows] for values in vars(self).values()))
+
 
 @dataclass(frozen=True)
 class FrameEvidence:
@@ -52,6 +57,8 @@ class FrameEvidence:
     has_masks: bool  # whether the frame's masks could be read
     words: Words  # of its source
     pair: Pair | None = None  # its images, where distances can be measured by them
+    # Boxes (M, 4) around the left masks of cars by the way in which they may have to be read, see `reread_boxes`.
+    reread: dict[str, Floats] = field(default_factory=dict)
 
 
 def evidence_of_scene(frames: FrameBatch, detections: Detections, words: Words | None = None) -> list[FrameEvidence]:
@@ -68,6 +75,25 @@ def evidence_of_scene(frames: FrameBatch, detections: Detections, words: Words |
         _frame_evidence(frames, detections, number, _known_rows(detections, number, known), (height, width), words)
         for number, (height, width) in enumerate(sizes)
     ]
+
+
+def reread_boxes(masks: Iterable[NDArray[np.bool_]]) -> dict[str, Floats]:
+    """Boxes around masks (H, W) whose file was written in another order of pixels than it was read in.
+
+    Run lengths go down the columns; read so, those that went along the rows are scattered over the whole image.
+    """
+    whole = list(masks)
+    row_by_row = [_box_around(mask.T.reshape(mask.shape)) for mask in whole]
+    exchanged = [_box_around(mask)[[1, 0, 3, 2]] for mask in whole]
+    boxes = {"row by row": row_by_row, "with rows and columns exchanged": exchanged}
+    return {way: np.array(some, dtype=np.float64).reshape(-1, 4) for way, some in boxes.items()}
+
+
+def _box_around(mask: NDArray[np.bool_]) -> Floats:
+    """u_min, v_min, u_max, v_max of the middle 98 % of the pixels: a run that is cut by an edge lies elsewhere."""
+    v, u = np.nonzero(mask)
+    low, high = (np.percentile([u, v], part, axis=1) for part in (1, 99))
+    return np.asarray(np.concatenate([low, high]))
 
 
 def _known_rows(detections: Detections, number: int, known: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -90,6 +116,10 @@ def _frame_evidence(
         _array(d.box_2d.index_select(0, chosen)),
     )
     left = list(zip(around["left"], has["left"], strict=True))
+    whole = tuple(
+        (masks["left"][row] > 0.5).cpu().numpy()[: size_hw[0], : size_hw[1]] if known else None
+        for row, known in enumerate(has["left"])
+    )
     return FrameEvidence(
         frame_id=frames.frame_ids[number],
         boxes=boxes,
@@ -97,13 +127,11 @@ def _frame_evidence(
         overlap={side: box_iou(boxes.box_2d, around[side]).diagonal() for side in SIDES},
         num_masks={side: int(has[side].sum()) for side in SIDES},
         seen=tuple(box[None][: int(known)] for box, known in left),
-        masks=tuple(
-            (masks["left"][row] > 0.5).cpu().numpy()[: size_hw[0], : size_hw[1]] if known else None
-            for row, known in enumerate(has["left"])
-        ),
+        masks=whole,
         camera=_camera_of(frames.camera, number),
         size_hw=size_hw,
         has_masks=True,
+        reread=reread_boxes(mask for mask in whole if mask is not None),
         words=words,
         pair=_pair(frames, number, size_hw),
     )

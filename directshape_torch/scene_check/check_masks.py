@@ -40,6 +40,8 @@ def check_masks(frames: Sequence[FrameEvidence]) -> list[Finding]:
             "than in the left ones"
         )
         return [found("masks_swapped", "all frames", measured)]
+    if left <= OVERLAP_WARNING and (reread := _reread(frames, left)):
+        return [reread]
     if left <= OVERLAP_WARNING:
         enough = sum(_pairs(frame) for frame in frames) >= MIN_PAIRS
         return [_mismatch("error" if left < OVERLAP_ERROR and enough else "warning", "all frames", left)]
@@ -47,6 +49,21 @@ def check_masks(frames: Sequence[FrameEvidence]) -> list[Finding]:
     overlaps = {frame.frame_id: _mean_overlap([frame], "left") for frame in frames if _pairs(frame) > 1}
     wrong = {frame_id: overlap for frame_id, overlap in overlaps.items() if overlap < OVERLAP_ERROR}
     return [_mismatch("warning", f"frame {frame_id}", overlap) for frame_id, overlap in wrong.items()]
+
+
+def _reread(frames: Sequence[FrameEvidence], left: float) -> Finding | None:
+    """That left masks fit once their pixels are read in another order; `left` is their overlap as they are."""
+    overlaps = {
+        way: np.concatenate([_reassigned(projected_boxes(frame), frame.reread[way]) for frame in frames])
+        for way in frames[0].reread
+    }
+    ways = {way: float(values.mean()) for way, values in overlaps.items() if len(values) > 1}
+    way = max(ways, key=ways.__getitem__, default="")
+    if not way or ways[way] < MOVED_OVERLAP or ways[way] < left + MOVED_GAIN:
+        return None
+    measured = f"masks and boxes of cars overlap by {left:.2f} in the mean, and by {ways[way]:.2f} when read {way}"
+    cure = "write run lengths down the columns (np.asfortranarray(mask)), and polygons as x0, y0, x1, y1, .."
+    return found("masks_elsewhere", "all frames", measured, cure=cure, limit=OVERLAP_WARNING)
 
 
 def check_placement(frames: Sequence[FrameEvidence], explained: float) -> list[Finding]:

@@ -110,6 +110,13 @@ def names(findings: Iterable[Finding]) -> set[str]:
     return {finding.check for finding in findings if finding.severity != "warning"}
 
 
+SAID_BY_THE_RUN = frozenset(
+    {"left_image", "right_image", "image_size", "calibration_file", "detection_file", "mask_file", "mask_size"}
+    | {"plane_file", "lidar_file", "no_cars"}
+)
+"""Findings about files that a run cannot read either, which it says of each frame."""
+
+
 class Mistake(NamedTuple):
     """A kind of mistake. What depends on the case is in braces, for `str.format`.
 
