@@ -129,7 +129,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _warned_of(dataset: StereoDataset, config: RefinerConfig) -> RefinerConfig:
-    """Print what the first frames show to be wrong; settings with which calls do not look again."""
+    """Print what the first frames show to be wrong; settings with which calls do not look again.
+
+    Raises:
+        InputError: their LiDAR points lie elsewhere, which would ruin cars that are right without them.
+    """
     if config.check == "off":
         return config
     findings, _ = check_frames(dataset, dataset.frame_ids[:_CHECKED_FRAMES], match_images=False)
@@ -137,6 +141,9 @@ def _warned_of(dataset: StereoDataset, config: RefinerConfig) -> RefinerConfig:
         # Which frame cannot be read, or has no cars, the run says itself, and goes on with the others.
         if finding.check not in SAID_BY_THE_RUN:
             print(f"check: {finding} ('directshape check-data' looks closer)", file=sys.stderr)
+        if finding.check == "lidar_elsewhere" and finding.severity == "error":
+            cure = f"{finding.cure}; or refine without --lidar, or with --set check=off"
+            raise InputError("--lidar", f"scans that fit the images ({finding.expected})", finding.measured, cure)
     return replace(config, check="off")
 
 

@@ -21,8 +21,9 @@ from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_c
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.mask_matching import MIN_OVERLAP, assign
 from directshape_torch.io.stereo_dataset import StereoDataset
+from directshape_torch.io.velodyne import lidar_pose, points_by_columns, read_points
 from directshape_torch.scene import MOST_TELLING, SIDES
-from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence, Pair, reread_boxes
+from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence, Pair, Scan, reread_boxes
 from directshape_torch.scene_check.check_images import (
     SPOILS_CAMERA,
     SPOILS_PAIR,
@@ -93,7 +94,19 @@ def check_frame(
     if camera is None or size_hw is None:
         return findings, len(cars), None
     evidence = _evidence(frame_id, cars, masks, camera, size_hw, words)
-    return findings, len(cars), replace(evidence, pair=None if names(findings) & SPOILS_PAIR else pair)
+    scan = attempt(
+        "lidar_file", "points of x, y, z, reflectance, and where the scanner is", partial(_scan, dataset, files)
+    )
+    return findings, len(cars), replace(evidence, scan=scan, pair=None if names(findings) & SPOILS_PAIR else pair)
+
+
+def _scan(dataset: StereoDataset, files: FrameFiles) -> Scan | None:
+    """The LiDAR scan of a frame, None where the data set has none."""
+    if dataset.lidar_dir is None:
+        return None
+    path = files.within(dataset.lidar_dir, ".bin")
+    read_points(path)
+    return Scan(points_by_columns(path), lidar_pose(files.read_lidar_calibration()))
 
 
 def _read_pair(files: FrameFiles, attempt: _Attempts) -> Pair | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,43 +17,68 @@ from directshape_torch.geometry.projection import project
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 
-_BYTES_A_POINT = 16
+NUM_COLUMNS = 4  # x, y, z, reflectance
+_POSSIBLE_COLUMNS = (NUM_COLUMNS, 5, 6, 3)
 _NEAREST_M = 1.0
 
 
 def read_scan(path: Path | str, calibration: KittiCalibration) -> Tensor:
     """All points of a scan (P, 3), float64, metres, in the left camera; its calibration says where the scanner is."""
+    T_cam_lidar = lidar_pose(calibration)
+    return torch.from_numpy(read_points(path) @ T_cam_lidar[:3, :3].T + T_cam_lidar[:3, 3])
+
+
+def lidar_pose(calibration: KittiCalibration) -> NDArray[np.float64]:
+    """T_cam_lidar (4, 4): from the scanner (x forward, y left, z up) to the left camera.
+
+    Raises:
+        DataFormatError: the calibration does not say where the scanner is.
+    """
     if calibration.R0_rect is None or calibration.Tr_velo_to_cam is None:
         missing = "R0_rect" if calibration.R0_rect is None else "Tr_velo_to_cam"
         raise DataFormatError(
             calibration.path, f"has no line {missing}:", cure="LiDAR needs R0_rect and Tr_velo_to_cam"
         )
-    points_velo = read_points(path)
-    rotation = calibration.R0_rect @ calibration.Tr_velo_to_cam[:, :3]
-    points_ref = points_velo @ rotation.T + calibration.R0_rect @ calibration.Tr_velo_to_cam[:, 3]
-    return torch.from_numpy(points_ref) + to_stereo_camera(calibration).t_cam_ref[0]
+    T_cam_lidar = np.eye(4)
+    T_cam_lidar[:3] = calibration.R0_rect @ calibration.Tr_velo_to_cam
+    T_cam_lidar[:3, 3] += to_stereo_camera(calibration).t_cam_ref[0].double().numpy()
+    return T_cam_lidar
 
 
 def read_points(path: Path | str) -> NDArray[np.float64]:
     """Points (P, 3), metres, in the frame of the file.
 
     KITTI's `.bin` is little-endian float32, four a point: x, y, z, reflectance; `.npy` is an array (P, 3 or more).
+    Points whose coordinates are not finite are left out: the scanner has seen nothing there.
     """
-    if Path(path).suffix.lower() == ".npy":
+    path = Path(path)
+    if path.suffix.lower() == ".npy":
         points = read_npy(path)
         if points.ndim != 2 or points.shape[1] < 3 or not len(points) or points.dtype.kind not in "fiu":
             got = f"{points.dtype} of shape {points.shape}"
             raise DataFormatError(path, f"expected one point or more as numbers (P, 3 or more), got {got}")
-    else:
-        content = read_bytes(path)
-        if len(content) == 0 or len(content) % _BYTES_A_POINT:
-            raise DataFormatError(path, f"expected 16 bytes a point (x, y, z, reflectance), got {len(content)} bytes")
-        points = np.frombuffer(content, dtype="<f4").reshape(-1, 4)
-    xyz: NDArray[np.float64] = points[:, :3].astype(np.float64)
-    is_finite = np.isfinite(xyz).all(axis=1)
-    if not is_finite.all():
-        number = int(is_finite.argmin())
-        raise DataFormatError(path, f"expected finite coordinates, got {xyz[number].tolist()} in point {number}")
+        return _finite(path, points[:, :3])
+    by_columns = points_by_columns(path)
+    if NUM_COLUMNS not in by_columns:
+        others = ", ".join(map(str, by_columns))
+        problem = f"expected 16 bytes a point (x, y, z, reflectance), got {path.stat().st_size} bytes"
+        cure = f"these are whole points of {others} numbers each (nuScenes writes 5): keep four" if others else ""
+        raise DataFormatError(path, problem, cure=cure)
+    return _finite(path, by_columns[NUM_COLUMNS])
+
+
+def points_by_columns(path: Path) -> dict[int, NDArray[np.float32]]:
+    """What the numbers of a `.bin` file are as points (P, 3), by each number of columns that a point could have."""
+    content = read_bytes(path)
+    counts = [count for count in _POSSIBLE_COLUMNS if content and not len(content) % (4 * count)]
+    return {count: np.frombuffer(content, dtype="<f4").reshape(-1, count)[:, :3] for count in counts}
+
+
+def _finite(path: Path, points: NDArray[Any]) -> NDArray[np.float64]:
+    xyz: NDArray[np.float64] = points.astype(np.float64)
+    xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    if not len(xyz):
+        raise DataFormatError(path, f"none of its {len(points)} points has finite coordinates")
     return xyz
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -39,6 +40,23 @@ class CarBoxes:
         return CarBoxes(*(values[rows] for values in vars(self).values()))
 
 
+# A LiDAR's axes as a camera's: x forward, y left, z up become x right, y down, z forward.
+T_CAMERA_LIDAR: Floats = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+
+
+class Scan(NamedTuple):
+    """The points of a LiDAR as they are given."""
+
+    points: Mapping[int, NDArray[Any]]  # (P, 3) by the number of columns that the numbers of the file are read with
+    T_cam_lidar: Floats  # (4, 4) from x forward, y left, z up to the left camera
+    columns: int = 4  # that a point has as documented
+
+    @property
+    def given(self) -> NDArray[Any]:  # (P, 3)
+        """The points read as documented."""
+        return self.points[self.columns]
+
+
 @dataclass(frozen=True)
 class FrameEvidence:
     """The N boxes of a frame and the masks that belong to them."""
@@ -59,6 +77,7 @@ class FrameEvidence:
     pair: Pair | None = None  # its images, where distances can be measured by them
     # Boxes (M, 4) around the left masks of cars by the way in which they may have to be read, see `reread_boxes`.
     reread: dict[str, Floats] = field(default_factory=dict)
+    scan: Scan | None = None  # of its LiDAR, where there is one
 
 
 def evidence_of_scene(frames: FrameBatch, detections: Detections, words: Words | None = None) -> list[FrameEvidence]:
@@ -134,7 +153,14 @@ def _frame_evidence(
         reread=reread_boxes(mask for mask in whole if mask is not None),
         words=words,
         pair=_pair(frames, number, size_hw),
+        scan=None if frames.points_cam is None else _scan(_array(frames.points_cam[number])),
     )
+
+
+def _scan(points_cam: Floats) -> Scan:
+    """Points (P, 3) of the left camera as those of a LiDAR that stands there."""
+    points_cam = points_cam[np.isfinite(points_cam).all(axis=1)]
+    return Scan({4: points_cam @ T_CAMERA_LIDAR[:3, :3]}, T_CAMERA_LIDAR)
 
 
 def _pair(frames: FrameBatch, number: int, size_hw: tuple[int, int]) -> Pair:

@@ -18,6 +18,7 @@ from directshape_torch.scene_check.check_images import (
     check_images,
     without_doubts,
 )
+from directshape_torch.scene_check.check_lidar import check_lidar
 from directshape_torch.scene_check.check_masks import check_masks
 from directshape_torch.scene_check.check_places import check_distances, check_heading, check_swapped, measure_cars
 from directshape_torch.scene_check.check_tones import check_tones
@@ -92,7 +93,7 @@ def _check_camera(one: FrameEvidence) -> list[Finding]:
 def check_cars(frames: Sequence[FrameEvidence]) -> list[Finding]:
     """Boxes, masks and distances, each only where what it rests on was found right."""
     cars = np.concatenate([np.empty((0, 3)), *(measure_cars(one, *one.pair) for one in frames if one.pair is not None)])
-    frames = [frame for frame in frames if len(frame.boxes)]
+    with_scans, frames = frames, [frame for frame in frames if len(frame.boxes)]
     swapped = check_swapped(cars)
     if swapped:
         return swapped
@@ -105,7 +106,10 @@ def check_cars(frames: Sequence[FrameEvidence]) -> list[Finding]:
         of_masks = check_masks(frames)
         return [*of_boxes, *(found for found in of_masks if found.check != "masks_elsewhere" or not explained)]
     found = [*of_boxes, *check_corners(frames), *check_masks(frames)]
-    return [*found, *check_distances(cars), *check_heading(frames)]
+    of_places = [*check_distances(cars), *check_heading(frames)]
+    # A wrong baseline moves what the images say, not the points.
+    of_scans = [] if "distance_scale" in {finding.check for finding in of_places} else check_lidar(with_scans)
+    return [*found, *of_places, *of_scans]
 
 
 def _once(findings: Sequence[Finding]) -> list[Finding]:

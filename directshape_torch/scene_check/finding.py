@@ -215,6 +215,11 @@ MISTAKES: dict[str, Mistake] = {
         "within {limit}",
         "check focal length and baseline, or the detector's training; 'directshape refine' goes by the images",
     ),
+    "lidar_elsewhere": Mistake(
+        "error",
+        "at least {limit}",
+        "no known way to read the scans fits: check that scan and images are of the same frame, and Tr_velo_to_cam",
+    ),
     "distance_scale": Mistake("error", "within {limit:.0%}", "check focal length, baseline and the units of the boxes"),
 }
 

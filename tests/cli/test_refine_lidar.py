@@ -104,8 +104,10 @@ def test_a_missing_or_damaged_scan_fails_its_frame_by_name(
     at = f"frame 000000 failed: {scans / '000000.bin'}: "
     assert at + "cannot be read (No such file or directory)" in failure(None)
     assert at + "expected 16 bytes a point (x, y, z, reflectance), got 17 bytes" in failure(bytes(17))
-    cut = np.array([[9, 0, 0, 0], [9, np.nan, 0, 0]], dtype="<f4").tobytes()
-    assert at + "expected finite coordinates, got [9.0, nan, 0.0] in point 1" in failure(cut)
+    nothing = np.full((3, 4), np.nan, dtype="<f4").tobytes()
+    assert at + "none of its 3 points has finite coordinates" in failure(nothing)
+    assert at + "expected 16 bytes a point" in failure(bytes(20))
+    assert "whole points of 5 numbers each (nuScenes writes 5): keep four" in failure(bytes(20))
 
 
 def test_a_calibration_without_scanner(

@@ -1,0 +1,180 @@
+"""Whether LiDAR points lie where the images show something, and if not, which other way to read them fits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.scene_check.car_evidence import T_CAMERA_LIDAR, Floats, FrameEvidence, Pair, Scan
+from directshape_torch.scene_check.finding import Finding, Severity, found
+from directshape_torch.stereo_matching.disparity import match_disparity
+
+# Share of the points above the road whose disparity is that of the images. Right scans reach 0.73 and more, those of
+# other frames, axes and columns 0.44 at most.
+AGREEMENT_ERROR, AGREEMENT_WARNING = 0.5, 0.6
+# What another way to read a scan must gain.
+_MIN_GAIN = 0.2
+_TIE = 0.03
+# Both in pixels and as a share: the error of a rig's disparity and that of the matching.
+_TOLERANCE_PX, _TOLERANCE_SHARE = 2.0, 0.05
+# Roads look alike in all frames, so points that far below the camera say little.
+_ROAD_BELOW_M = 1.2
+_NEAREST_M = 1.0
+_FEWEST_POINTS = 100
+_MOST_POINTS = 5000
+_AS_DOCUMENTED = "as documented"
+_AXES: dict[str, tuple[int, int, int]] = {  # signed axes of the file, from 1, that become x forward, y left, z up
+    _AS_DOCUMENTED: (1, 2, 3),
+    "x and y exchanged": (2, 1, 3),
+    "x right, y forward, z up (nuScenes)": (2, -1, 3),
+    "x right, y down, z forward (a camera's)": (3, -1, -2),
+    "x forward, y left, z up where a camera's axes are expected": (-2, -3, 1),
+    "y to the right": (1, -2, 3),
+    "y to the right, z down": (1, -2, -3),
+    "x backward, y to the right": (-1, -2, 3),
+    "y and z exchanged": (1, 3, 2),
+}
+_UNITS = {_AS_DOCUMENTED: 1.0, "millimetres": 0.001, "centimetres": 0.01}
+
+
+class _Way(NamedTuple):
+    """One way to read a scan."""
+
+    columns: int
+    axes: str
+    unit: str
+    place: str
+
+    def is_possible(self, scan: Scan) -> bool:
+        """Whether the file could have such columns, and points of tensors have no calibration that could be wrong."""
+        is_tensor = scan.T_cam_lidar is T_CAMERA_LIDAR
+        return self.columns in scan.points and (self.place == _AS_DOCUMENTED or not is_tensor)
+
+    def words(self, scan: Scan) -> list[str]:
+        """Where it differs from the documented way."""
+        of_columns = [] if self.columns == scan.columns else [f"as {self.columns} numbers a point"]
+        parts = {"with the axes": self.axes, "in": self.unit, "with the calibration": self.place}
+        return of_columns + [f"{part} {value}" for part, value in parts.items() if value != _AS_DOCUMENTED]
+
+
+def check_lidar(frames: Sequence[FrameEvidence]) -> list[Finding]:
+    """What the scans of all frames show against their images, of those that have both."""
+    judges = {
+        one.frame_id: _Judge(one.scan, one.pair, one.camera)
+        for one in frames
+        if one.scan is not None and one.pair is not None and len(one.scan.given) >= _FEWEST_POINTS
+    }
+    telling = [judge for judge in judges.values() if judge.can_tell]
+    shares = {name: judge.share(_as_documented(judge.scan)) for name, judge in judges.items() if judge.can_tell}
+    if not shares:
+        return []
+    mean = float(np.mean(list(shares.values())))
+    if mean >= AGREEMENT_WARNING:
+        wrong = {name: share for name, share in shares.items() if share < AGREEMENT_ERROR}
+        return [_finding("warning", f"frame {name}", share, "", "") for name, share in wrong.items()]
+    better = _better_way(telling, mean)
+    severity: Severity = "error" if better or mean < AGREEMENT_ERROR else "warning"
+    return [_finding(severity, f"all frames, {len(shares)} scans", mean, *(better or ("", "")))]
+
+
+def _finding(severity: Severity, where: str, share: float, fits: str, cure: str) -> Finding:
+    measured = f"{share:.0%} of the LiDAR points above the road have the disparity of the images"
+    measured = f"{measured}{fits}".replace("%", " %")
+    limit = f"{AGREEMENT_WARNING:.0%}".replace("%", " %")
+    return found("lidar_elsewhere", where, measured, severity=severity, cure=cure, limit=limit)
+
+
+def _better_way(judges: Sequence[_Judge], mean: float) -> tuple[str, str] | None:
+    """Words for the way to read the scans that fits clearly better, the simplest of equals, and its cure."""
+    ways = [way for way in _ways() if all(way.is_possible(judge.scan) for judge in judges)]
+    shares = np.array([np.mean([judge.share(way) for judge in judges]) for way in ways])
+    close = np.flatnonzero(shares > shares.max() - _TIE).tolist()
+    scan = judges[0].scan
+    best = min(close, key=lambda k: (len(ways[k].words(scan)), -shares[k]))
+    if shares[best] < AGREEMENT_ERROR or shares[best] < mean + _MIN_GAIN:
+        return None
+    words = ", ".join(ways[best].words(scan))
+    fits = f", {shares[best]:.0%} when the scan is read {words}"
+    return fits, f"give points as documented (docs/inputs.md): they fit when read {words}"
+
+
+def _ways() -> Iterator[_Way]:
+    return (_Way(*parts) for parts in product((4, 5, 6, 3), _AXES, _UNITS, _PLACES))
+
+
+def _as_documented(scan: Scan) -> _Way:
+    return _Way(scan.columns, _AS_DOCUMENTED, _AS_DOCUMENTED, _AS_DOCUMENTED)
+
+
+def _inverse(T: Floats) -> Floats:
+    return np.asarray(np.linalg.inv(T))
+
+
+def _nominal(_: Floats) -> Floats:
+    return T_CAMERA_LIDAR
+
+
+def _given(T: Floats) -> Floats:
+    return T
+
+
+_PLACES: dict[str, Callable[[Floats], Floats]] = {
+    _AS_DOCUMENTED: _given,
+    "inverted": _inverse,
+    "of a LiDAR beside the camera, not this one": _nominal,
+}
+
+
+def _points(scan: Scan, way: _Way) -> Floats:
+    """The points (P, 3) of a scan in the left camera, read in some way; those that are not finite left out."""
+    points = scan.points[way.columns]
+    # By chance: every n-th point of wrong columns may be whole.
+    points = points[np.random.default_rng(0).choice(len(points), min(len(points), _MOST_POINTS), replace=False)]
+    points = points[np.isfinite(points).all(axis=1)]
+    signed = _AXES[way.axes]
+    with np.errstate(over="ignore", invalid="ignore"):
+        points = _UNITS[way.unit] * points[:, [abs(axis) - 1 for axis in signed]] * np.sign(signed)
+        T = _PLACES[way.place](scan.T_cam_lidar)
+        return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+
+
+class _Judge:
+    """The scan and both images of a frame, and how well they agree."""
+
+    def __init__(self, scan: Scan, pair: Pair, camera: StereoCamera) -> None:
+        self.scan = scan
+        self.K_left, self.K_right = camera.K_left[0].numpy(), camera.K_right[0].numpy()
+        self.T_right_cam = camera.T_right_cam[0].numpy()
+        self.disparity = match_disparity(*pair)
+        self.can_tell = int(np.isfinite(self.disparity).sum()) >= _MOST_POINTS
+        documented = _as_documented(scan)
+        # Of wrong columns some points are whole, and most of the others fall out of the image.
+        self._fewest = max(float(self._agree(documented._replace(columns=count)).sum()) for count in scan.points)
+
+    def share(self, way: _Way) -> float:
+        """Share of the points above the road whose disparity is that of the images, where that is known."""
+        agree = self._agree(way)
+        return float(agree.sum()) / max(len(agree), self._fewest, _FEWEST_POINTS)
+
+    def _agree(self, way: _Way) -> Floats:
+        points_cam = _points(self.scan, way)
+        high = self._compared(points_cam[points_cam[:, 1] < _ROAD_BELOW_M])
+        return high if len(high) >= _FEWEST_POINTS else self._compared(points_cam)
+
+    def _compared(self, points_cam: Floats) -> Floats:
+        height, width = self.disparity.shape
+        points_cam = points_cam[points_cam[:, 2] > _NEAREST_M]
+        left = points_cam @ self.K_left.T
+        right = (points_cam @ self.T_right_cam[:3, :3].T + self.T_right_cam[:3, 3]) @ self.K_right.T
+        uv = left[:, :2] / left[:, 2:]
+        inside = ((uv > -0.5) & (uv < [width - 0.5, height - 0.5])).all(axis=1)
+        u, v = uv[inside].round().astype(int).T
+        expected = (uv[:, 0] - right[:, 0] / right[:, 2])[inside]
+        measured = self.disparity[v, u]
+        known = np.isfinite(measured)
+        limit = np.maximum(_TOLERANCE_PX, _TOLERANCE_SHARE * measured[known])
+        return np.asarray(np.abs(expected[known] - measured[known]) < limit, dtype=np.float64)
