@@ -9,16 +9,17 @@ from functools import partial
 from typing import TypeVar
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, DirectShapeError
-from directshape_torch.geometry.image_boxes import box_iou
+from directshape_torch.geometry.image_boxes import box_iou, project_boxes
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_layout import FrameFiles
 from directshape_torch.io.image_files import as_pair, read_colours
 from directshape_torch.io.instance_masks import InstanceMask, MaskSizeError
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
-from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.kitti_labels import KittiObject, poses_cam
 from directshape_torch.io.mask_matching import MIN_OVERLAP, assign
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.io.velodyne import lidar_pose, points_by_columns, read_points
@@ -32,7 +33,7 @@ from directshape_torch.scene_check.check_images import (
     without_doubts,
 )
 from directshape_torch.scene_check.check_tones import check_tones
-from directshape_torch.scene_check.finding import Finding, names, unreadable
+from directshape_torch.scene_check.finding import Finding, found, names, unreadable
 from directshape_torch.scene_check.words import Words, words_of_files
 
 _Part = TypeVar("_Part")
@@ -94,6 +95,13 @@ def check_frame(
     if camera is None or size_hw is None:
         return findings, len(cars), None
     evidence = _evidence(frame_id, cars, masks, camera, size_hw, words)
+    none = int((evidence.boxes.box_2d == 0).all(axis=1).sum())
+    if none:
+        measured = (
+            f"{none} of {len(evidence.boxes)} detections have no 2D box of their own (-1, zeros, or one for several)"
+        )
+        cure = "nothing, where masks are found: by the projected 3D boxes; AP by KITTI's rules needs 2D boxes"
+        findings.append(found("box_2d", attempt.where, measured, severity="note", cure=cure))
     scan = attempt(
         "lidar_file", "points of x, y, z, reflectance, and where the scanner is", partial(_scan, dataset, files)
     )
@@ -142,11 +150,15 @@ def _evidence(
         _columns([o.hwl for o in cars], 3),
         np.array([o.rotation_y for o in cars], dtype=np.float64),
         np.array([o.alpha for o in cars], dtype=np.float64),
-        _columns([o.box_2d for o in cars], 4),
+        _own_boxes(cars),
     )
+    # Where the file has no 2D box nothing but the projected 3D box says where the mask may be.
+    T_cam_obj = poses_cam(cars, camera.t_cam_ref[0])
+    projected, _ = project_boxes(T_cam_obj, torch.from_numpy(boxes.hwl), camera, size_hw)
+    expected = np.where((boxes.box_2d == 0).all(axis=1, keepdims=True), projected, boxes.box_2d)
     of_cars = {side: [mask for mask in masks or [] if mask.is_car and mask.side == side] for side in SIDES}
     around = {side: _columns([mask.mask_box for mask in of_side], 4) for side, of_side in of_cars.items()}
-    overlap = {side: np.nan_to_num(box_iou(boxes.box_2d, around[side])) for side in SIDES}
+    overlap = {side: np.nan_to_num(box_iou(expected, around[side])) for side in SIDES}
     matches = {side: assign(np.where(each >= MIN_OVERLAP, each, 0.0)) for side, each in overlap.items()}
     rows = _telling(cars, matches["left"])
     own = {side: [None if (k := matches[side][row]) < 0 else of_cars[side][k] for row in rows] for side in SIDES}
@@ -170,6 +182,14 @@ def _evidence(
         has_masks=masks is not None,
         words=words,
     )
+
+
+def _own_boxes(cars: Sequence[KittiObject]) -> NDArray[np.float64]:
+    """The 2D boxes (N, 4) of the file, zeros for what is none: -1, zeros, or the same numbers for several cars."""
+    boxes = _columns([o.box_2d for o in cars], 4)
+    _, inverse, counts = np.unique(boxes, axis=0, return_inverse=True, return_counts=True)
+    is_none = (boxes <= 0).all(axis=1) | (counts[inverse.reshape(-1)] > 1)
+    return np.where(is_none[:, None], 0.0, boxes)
 
 
 def _telling(cars: Sequence[KittiObject], masks_left: Sequence[int]) -> list[int]:

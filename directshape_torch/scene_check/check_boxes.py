@@ -162,8 +162,9 @@ def check_box_2d(frames: Sequence[FrameEvidence]) -> list[Finding]:
 
 
 def check_corners(frames: Sequence[FrameEvidence]) -> list[Finding]:
-    """Whether 2D boxes end after they begin."""
+    """Whether 2D boxes end after they begin; those that are no box at all are looked at with the files."""
     boxes = np.concatenate([np.empty((0, 4)), *(frame.boxes.box_2d for frame in frames)])
+    boxes = boxes[(boxes != 0).any(axis=1)]
     empty = int((boxes[:, 2:] <= boxes[:, :2]).any(axis=1).sum())
     if not empty:
         return []
@@ -174,6 +175,6 @@ def check_corners(frames: Sequence[FrameEvidence]) -> list[Finding]:
             f"{empty} 2D boxes end before they begin",
             severity="error" if 2 * empty > len(boxes) else "warning",
             expected="u_min v_min u_max v_max, pixels, with u_min < u_max and v_min < v_max",
-            cure="leave out detections that are not in the image; masks are found by these boxes",
+            cure="write the corners in this order, or zeros: masks are then found by the projected 3D boxes",
         )
     ]

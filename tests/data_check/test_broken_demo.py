@@ -12,10 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import pytest
 
 import directshape_torch
+from directshape_torch.cli.main import main
 from directshape_torch.data_check.check_dataset import check_dataset
+from directshape_torch.io.instance_masks import decode_segmentation
 from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.scene_check import check_images
 from directshape_torch.scene_check.finding import CheckReport
@@ -121,6 +124,41 @@ def cut(name: str) -> Break:
     return lambda root: (root / name).write_bytes((root / name).read_bytes()[: (root / name).stat().st_size // 2])
 
 
+def row_by_row(segmentation: dict[str, Any]) -> dict[str, Any]:
+    """Run lengths along the rows in the place of those down the columns."""
+    height, width = segmentation["size"]
+    inside = decode_segmentation(Path("masks.json"), "entry", segmentation, (height, width))
+    pixels = inside.ravel(order="C")
+    ends = [*(np.flatnonzero(np.diff(pixels)) + 1).tolist(), len(pixels)]
+    runs = np.diff([0, *ends]).tolist()
+    return {"size": [height, width], "counts": [0, *runs] if pixels[0] else runs}
+
+
+def in_16_bits(bits: int) -> Break:
+    """Both images as a camera of so many bits gives them."""
+
+    def apply(root: Path) -> None:
+        for name in (LEFT, RIGHT):
+            image = cv2.imread(str(root / name)).astype(np.float64)
+            cv2.imwrite(str(root / name), np.rint(image * ((2**bits - 1) / 255)).astype(np.uint16))
+
+    return apply
+
+
+def images(change: Callable[[Any], Any], *names: str) -> Break:
+    """Changes of the pixels of some images."""
+
+    def apply(root: Path) -> None:
+        for name in names:
+            cv2.imwrite(str(root / name), change(cv2.imread(str(root / name))))
+
+    return apply
+
+
+def without_box_2d(words: list[str]) -> None:
+    words[4:8] = ["-1", "-1", "-1", "-1"]
+
+
 # The finding that must be there, and whether it must be alone: what follows from a mistake is no further one.
 BREAKS: dict[str, tuple[Break, str, bool]] = {
     "left and right images swapped": (swapped(LEFT, RIGHT), "images_swapped", True),
@@ -140,6 +178,10 @@ BREAKS: dict[str, tuple[Break, str, bool]] = {
         True,
     ),
     "masks of another category": (masks(category_id=lambda _: 1), "no_masks", False),
+    "masks written row by row": (masks(segmentation=row_by_row), "masks_elsewhere", True),
+    "images of 12 bits in 8": (images(lambda image: image // 16, LEFT, RIGHT), "grey_levels", False),
+    "right image of red and blue exchanged": (images(lambda image: image[..., ::-1], RIGHT), "grey_levels", False),
+    "right image a negative": (images(lambda image: 255 - image, RIGHT), "grey_levels", False),
     "missing right image": (lambda root: (root / RIGHT).unlink(), "missing_files", False),
     "missing masks": (lambda root: (root / MASKS).unlink(), "missing_files", False),
     "cut left image": (cut(LEFT), "left_image", False),
@@ -165,3 +207,27 @@ def test_a_break_is_found(broken: Break, check: str, alone: bool, tmp_path: Path
     if alone:
         assert found == {check}
         assert report.exit_code == 1
+
+
+@pytest.mark.parametrize("bits", [10, 12, 16])
+def test_images_of_more_bits_are_as_right_as_those_of_8(tmp_path: Path, bits: int) -> None:
+    assert report_of(tmp_path, in_16_bits(bits)).findings == ()
+
+
+def test_a_file_without_2d_boxes_is_right_and_said_to_be_so(tmp_path: Path) -> None:
+    report = report_of(tmp_path, boxes(without_box_2d))
+    assert [(finding.check, finding.severity) for finding in report.findings] == [("box_2d", "note")]
+    assert report.findings[0].measured.startswith("6 of 6 detections have no 2D box of their own")
+    assert report.exit_code == 0
+
+
+@pytest.mark.parametrize("name", ["masks written row by row", "right image a negative", "box centre for bottom"])
+def test_refine_says_what_check_data_says(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    broken, check, _ = BREAKS[name]
+    said = {str(finding) for finding in report_of(tmp_path / "data", broken).findings if finding.check == check}
+    root = tmp_path / "data"
+    names = ["--data", root, "--detections", root / "detections", "--masks", root / "training" / "masks"]
+    main(["refine", *map(str, names), "--out", str(tmp_path / "out"), "--rig", "none", "--config", "fast"])
+    printed = capsys.readouterr().err
+    assert all(f"check: {finding} ('directshape check-data' looks closer)" in printed for finding in said)
+    assert said
