@@ -211,6 +211,19 @@ MISTAKES: dict[str, Mistake] = {
     "right images 2 px lower": Mistake(
         _images(lambda left, right: (left, right.roll(2, dims=2))), ("not_rectified", "rectify"), True
     ),
+    "right images negative": Mistake(
+        _images(lambda left, right: (left, 1 - right)), ("grey_levels", "are dark in the other")
+    ),
+    "right images of red and blue exchanged": Mistake(
+        _images(lambda left, right: (left, right.flip(1))), ("grey_levels", "red and blue exchanged")
+    ),
+    "images of 12 bits in 8": Mistake(
+        _images(lambda left, right: (left / 16, right / 16)), ("grey_levels", "are darker than")
+    ),
+    "masks written row by row": Mistake(
+        _masks(lambda masks: masks.reshape(len(masks), masks.shape[2], masks.shape[1]).transpose(1, 2)),
+        ("masks_elsewhere", "row by row"),
+    ),
     "left and right masks swapped": Mistake(_sides, ("masks_swapped", "swap the two sides")),
     "masks mirrored": Mistake(_masks(lambda masks: masks.flip(2)), ("masks_elsewhere", "mirror")),
     "masks shifted by 80 px": Mistake(

@@ -20,6 +20,9 @@ MIN_PAIRS = 4
 MIN_SWAP_GAIN = 0.1
 # Mean overlap with projected 3D boxes that masks must have, and gain, for a way in which they are wrong to be believed.
 MOVED_OVERLAP, MOVED_GAIN = 0.5, 0.2
+_ORDER_OF_PIXELS = (
+    "write run lengths down the columns (np.asfortranarray(mask)), polygons as x0, y0, x1, y1, .., and arrays as (H, W)"
+)
 
 
 def check_masks(frames: Sequence[FrameEvidence]) -> list[Finding]:
@@ -53,21 +56,25 @@ def check_masks(frames: Sequence[FrameEvidence]) -> list[Finding]:
 
 def _reread(frames: Sequence[FrameEvidence], left: float) -> Finding | None:
     """That left masks fit once their pixels are read in another order; `left` is their overlap as they are."""
-    overlaps = {
-        way: np.concatenate([_reassigned(projected_boxes(frame), frame.reread[way]) for frame in frames])
-        for way in frames[0].reread
-    }
-    ways = {way: float(values.mean()) for way, values in overlaps.items() if len(values) > 1}
+    ways = _read_otherwise(frames)
     way = max(ways, key=ways.__getitem__, default="")
     if not way or ways[way] < MOVED_OVERLAP or ways[way] < left + MOVED_GAIN:
         return None
     measured = f"masks and boxes of cars overlap by {left:.2f} in the mean, and by {ways[way]:.2f} when read {way}"
-    cure = "write run lengths down the columns (np.asfortranarray(mask)), and polygons as x0, y0, x1, y1, .."
-    return found("masks_elsewhere", "all frames", measured, cure=cure, limit=OVERLAP_WARNING)
+    return found("masks_elsewhere", "all frames", measured, cure=_ORDER_OF_PIXELS, limit=OVERLAP_WARNING)
+
+
+def _read_otherwise(frames: Sequence[FrameEvidence]) -> dict[str, float]:
+    """Mean overlap of projected 3D boxes and masks, one to one, by the way in which the masks are read."""
+    overlaps = {
+        way: np.concatenate([_reassigned(projected_boxes(frame), frame.reread[way]) for frame in frames])
+        for way in frames[0].reread
+    }
+    return {way: float(values.mean()) for way, values in overlaps.items() if len(values) > 1}
 
 
 def check_placement(frames: Sequence[FrameEvidence], explained: float) -> list[Finding]:
-    """Whether masks fit the 3D boxes once they are mirrored, shifted or given to other cars.
+    """Whether masks fit the 3D boxes once they are mirrored, shifted, given to other cars or read in another order.
 
     Args:
         frames: of all frames.
@@ -92,6 +99,7 @@ def check_placement(frames: Sequence[FrameEvidence], explained: float) -> list[F
             "give masks in the order of the boxes",
         ),
     }
+    ways |= {f"fit when read {way}": (overlap, _ORDER_OF_PIXELS) for way, overlap in _read_otherwise(frames).items()}
     (words, (overlap, cure)) = max(ways.items(), key=lambda way: way[1][0])
     if overlap < MOVED_OVERLAP or overlap < as_given + MOVED_GAIN or overlap < explained - 0.02:
         return []
