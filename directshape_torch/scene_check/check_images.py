@@ -17,7 +17,15 @@ from directshape_torch.scene_check.words import Words
 SPOILS_CAMERA = frozenset({"raw_intrinsics", "baseline_sign", "baseline_length", "focal_length", "principal_point"})
 SPOILS_PAIR = frozenset(
     {
-        *("images_swapped", "image_mirrored", "same_image", "different_scenes", "not_rectified", "few_matches"),
+        *(
+            "images_swapped",
+            "image_mirrored",
+            "same_image",
+            "different_scenes",
+            "not_rectified",
+            "few_matches",
+            "grey_levels",
+        ),
         "raw_intrinsics",
     }
 )
