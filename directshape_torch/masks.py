@@ -23,7 +23,7 @@ Masks = Union[Tensor, NDArray[Any], Sequence[Tensor | NDArray[Any] | None], "Mas
 """Masks of B instances as users have them: (B, H, W), B entries that are (H, W) or None, or crops."""
 
 # Resampling by cubic kernels overshoots by a quarter at an edge; logits and 0..255 go far beyond.
-_HIGHEST_PROBABILITY = 1.5
+_LOWEST_PROBABILITY, _HIGHEST_PROBABILITY = -0.5, 1.5
 
 
 @dataclass(frozen=True)
@@ -260,7 +260,7 @@ def _entries(name: str, masks: Masks) -> list[Tensor | None]:
     sizes = {tuple(mask.shape) for mask in entries if mask is not None}
     if len(sizes) != 1:
         got = f"{len(entries)} entries of sizes {sorted(sizes)}"
-        cure = "where no car has a mask give torch.zeros(number of cars, H, W)"
+        cure = "where no car has a mask give MaskCrops.none(number of cars, (H, W), like=boxes)"
         raise InputError(name, "masks of one size (H, W), or None where a car has none", got, cure)
     dtypes = {mask.dtype for mask in entries if mask is not None}
     if len(dtypes) > 1:
@@ -290,11 +290,12 @@ def _support(mask: Tensor) -> tuple[int, int, int, int]:
 
 
 def _checked(name: str, row: int, mask: Tensor) -> Tensor:
-    """The mask itself; raises `InputError` where it holds more than a probability."""
+    """The mask itself; raises `InputError` where it holds other numbers than probabilities."""
     if mask.dtype != torch.bool and mask.numel():
-        highest = float(mask.detach().nan_to_num(0.0, posinf=torch.inf).max())
-        if highest > _HIGHEST_PROBABILITY:
-            got = f"a value of {highest:g} in mask {row}"
+        known = mask.detach().nan_to_num(0.0, posinf=torch.inf, neginf=-torch.inf)
+        lowest, highest = (float(value) for value in known.aminmax())
+        if highest > _HIGHEST_PROBABILITY or lowest < _LOWEST_PROBABILITY:
+            got = f"a value of {highest if highest > _HIGHEST_PROBABILITY else lowest:g} in mask {row}"
             cure = "apply a sigmoid to logits, or divide by 255"
             raise InputError(name, "foreground probabilities in [0, 1]", got, cure)
     return mask

@@ -253,7 +253,9 @@ def test_masks_of_some_of_the_cars() -> None:
 def test_masks_are_asked_for_by_name() -> None:
     with pytest.raises(InputError, match="mask_left: expected masks of 2 cars in the left image, got None"):
         from_boxes(mask_left=None, mask_right=None)
-    with pytest.raises(InputError, match=r"mask_left: expected masks of one size.*; where no car has a mask give"):
+    with pytest.raises(
+        InputError, match=r"mask_left: expected masks of one size.*; where no car has a mask give MaskC"
+    ):
         from_boxes(mask_left=[None, None])
     with pytest.raises(InputError, match=r"mask_left: expected masks of one size .*\(3, 4\), \(3, 5\)"):
         from_boxes(mask_left=[torch.zeros(3, 4), torch.zeros(3, 5)])

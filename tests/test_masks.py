@@ -128,7 +128,7 @@ def test_zeros_have_gradients_too() -> None:
     assert mask.grad.nonzero().tolist() == [[0, 1, 2], [0, 3, 5]]
 
 
-@pytest.mark.parametrize("value", [1.6, 255.0, torch.inf])
+@pytest.mark.parametrize("value", [1.6, 255.0, torch.inf, -0.6, -20.0, -torch.inf])
 def test_more_than_a_probability_is_named(value: float) -> None:
     masks = torch.zeros(3, 4, 6)
     masks[1, 2, 3], masks[2, 1, 1] = value, torch.nan
@@ -153,7 +153,7 @@ def test_masks_may_overshoot_by_resampling() -> None:
         (None, r"masks: expected masks \(B, H, W\), or B entries that are \(H, W\) or None, got NoneType"),
         (torch.zeros(4, 6), r"masks: expected shape \(B, H, W\), got \(4, 6\)"),
         ([torch.zeros(4, 6), torch.zeros(4, 5)], r"masks: expected masks of one size .*\(4, 5\), \(4, 6\)"),
-        ([None, None], r"masks: expected masks of one size .*; where no car has a mask give torch.zeros"),
+        ([None, None], r"masks: expected masks of one size .*; where no car has a mask give MaskCrops.none"),
         (torch.zeros(1, 4, 6).long(), "masks: expected bool, or foreground probabilities .* got torch.int64"),
         ([np.zeros((1, 4, 6))], r"masks\[0\]: expected shape \(H, W\), got \(1, 4, 6\)"),
     ],

@@ -196,7 +196,8 @@ def find_warnings(frames: Mapping[str, Mapping[str, Any]], classes: Sequence[str
             f"none of the {num_lines} input lines is of class {', '.join(classes)} with a 3D box: nothing was refined"
         )
     elif num_cars and no_mask == num_cars:
-        found.append(f"none of the {num_cars} cars has a mask in the left image: check masks and their frame numbers")
+        checks = "check masks and their frame numbers"
+        found.append(f"none of the {num_cars} cars has a mask in the left image: {_reasons(frames) or checks}")
     elif num_cars and no_camera == num_cars:
         found.append(f"all {num_cars} initial boxes lie behind or at the camera: check the frame of the detections")
     elif num_cars and 2 * refined < num_cars:

@@ -44,7 +44,8 @@ def visible_files(folder: Path, endings: Iterable[str]) -> list[Path]:
     """
     wanted = frozenset(endings)
     names = sorted(name for name in _names(folder).values() if Path(name).suffix.lower() in wanted)
-    return [folder / name for name in names if (folder / name).is_file()]
+    # A broken link is somebody's file: that it leads nowhere is said when it is opened.
+    return [folder / name for name in names if not (folder / name).is_dir()]
 
 
 def _names(folder: Path) -> dict[str, str]:

@@ -33,6 +33,8 @@ from directshape_torch.numerics.conversion import Given, as_floating
 from directshape_torch.numerics.full_precision import in_full_precision
 
 BoxFormat = Literal["kitti", "mmdet3d_camera", "mmdet3d_lidar", "openpcdet", "nuscenes", "opencv"]
+# Headings that were added up go beyond one turn; degrees soon go beyond two.
+_MOST_TURNS = 2
 # Corners that were rounded to centimetres still make a box, those in another order do not.
 _CORNER_TOLERANCE_M = 0.05
 # Axes of the object frame (x forward, y down, z left) in those of a box whose z is up (x forward, y left).
@@ -207,7 +209,8 @@ def _to_camera(T_cam_boxes: Given | None, convention: str, like: Tensor) -> Tens
             nuscenes if convention == "nuscenes" else kitti,
         )
     T_cam_boxes = as_floating(T_cam_boxes)
-    shape = (4, 4) if isinstance(T_cam_boxes, Tensor) and T_cam_boxes.ndim == 2 else (len(like), 4, 4)
+    given = tuple(T_cam_boxes.shape) if isinstance(T_cam_boxes, Tensor) else ()
+    shape = given if given in ((4, 4), (1, 4, 4)) else (len(like), 4, 4)
     check_shape("T_cam_boxes", T_cam_boxes, shape, "give one motion, or one for each box", "floating")
     check_rotation("T_cam_boxes", T_cam_boxes.reshape(-1, 4, 4))
     return T_cam_boxes.to(like)
@@ -215,6 +218,9 @@ def _to_camera(T_cam_boxes: Given | None, convention: str, like: Tensor) -> Tens
 
 def _from_numbers(boxes: Tensor, form: BoxForm) -> tuple[Tensor, Tensor]:
     location, sizes, heading = boxes[:, :3], boxes[:, 3:6], boxes[:, 6]
+    cure = "turn degrees into radians: torch.deg2rad(heading)"
+    expected = f"headings in radians, which are within {_MOST_TURNS} turns"
+    check_rows("boxes", heading.detach().abs() > _MOST_TURNS * 2 * math.pi, boxes.detach(), expected, cure)
     hwl = sizes[:, [form.sizes.index(size) for size in "hwl"]]
     if form.upright:
         turn = rotation_about_y(-heading)  # about y one way is about z the other, with y and z exchanged

@@ -237,12 +237,14 @@ def _of_frame(directory: Path, names: Sequence[str]) -> tuple[MaskSource, str]:
 
 def _mots_text(directory: Path, names: Sequence[str]) -> Path | None:
     """The text file of KITTI MOTS for a frame of some names: that of its sequence, or the only one there is."""
-    if directory.is_file():
-        return directory
-    texts = visible_files(directory, [".txt"])
+    folders = [directory / name for name in ("", "data", "instances_txt")]
+    texts = [directory] if directory.is_file() else [text for each in folders for text in visible_files(each, [".txt"])]
     of_sequence = [text for text in texts if any(name.startswith(f"{text.stem}/") for name in names)]
-    is_single = len(texts) == 1 and not any("/" in name for name in names)
-    return of_sequence[0] if of_sequence else texts[0] if is_single else None
+    is_single = not any("/" in name for name in names)
+    if directory.is_file() and not (of_sequence or is_single):
+        problem = f"is not of sequence {names[0].partition('/')[0]}"
+        raise DataFormatError(directory, problem, cure="give the folder that holds one SEQUENCE.txt for each")
+    return of_sequence[0] if of_sequence else texts[0] if is_single and len(texts) == 1 else None
 
 
 def mask_source(directory: Path | str) -> FrameJsonMasks | InstancePngMasks:
@@ -274,11 +276,19 @@ def _coco_by_frame(path: Path) -> dict[int, list[_Entry]]:
     frames: dict[int, list[_Entry]] = {}
     for index, entry in enumerate(read_coco_list(path)):
         try:
-            frames.setdefault(int(entry["image_id"]), []).append((index, entry))
+            frames.setdefault(_whole(entry["image_id"]), []).append((index, entry))
         except (KeyError, TypeError, ValueError) as error:
             problem = f"entry {index}: 'image_id' is {shown(entry.get('image_id'))}, expected the frame's number"
-            raise DataFormatError(path, problem) from error
+            raise DataFormatError(path, problem, cure="write the number of the frame, or one file a frame") from error
     return frames
+
+
+def _whole(value: Any) -> int:
+    """A whole number; `int` alone would cut others, and take truth for one."""
+    number = int(value)
+    if isinstance(value, bool) or (isinstance(value, float) and number != value):
+        raise ValueError(f"{value!r} is no whole number")
+    return number
 
 
 def _from_coco(
@@ -313,7 +323,7 @@ def _from_coco(
 
 def _score(entry: Mapping[str, Any]) -> float:
     """The score of an entry; one without is as sure as the segmentation can be."""
-    score = float(entry.get("score", 1.0))
+    score = 1.0 if entry.get("score") is None else float(entry["score"])
     if not np.isfinite(score):
         raise ValueError(f"score {entry['score']} is not finite")
     return score

@@ -75,14 +75,16 @@ def match_masks(
         return MaskMatches(left, right, ["its entry has no mask" if mask is None else "" for mask in left], box_2d)
     hulls = {side: [_hull(uv, size_hw) for uv in outlines[side]] for side in SIDES}
     is_wanted = [o.type in classes for o in objects]
+    # Objects that are refined come before all others, which may be the same seen as another class.
     scores = np.array([0.0 if o.score is None else o.score for o in objects])
+    ranks = np.where(is_wanted, scores - scores.min(initial=0.0) + scores.max(initial=0.0) + 1, scores)
 
     def matched(side: Side, regions: Sequence[Sequence[_Pixels | None]]) -> tuple[list[InstanceMask | None], list[str]]:
         of_side = [mask for mask in masks if mask.side == side]
         fits = _fits(regions, of_side, size_hw)
         allowed = np.array([[mask.is_car or not wanted for mask in of_side] for wanted in is_wanted], dtype=bool)
         fits = np.where(allowed.reshape(fits.shape), fits, 0.0)
-        index = assign(np.where(fits >= MIN_OVERLAP, fits * _choices(fits, scores), 0.0))
+        index = assign(np.where(fits >= MIN_OVERLAP, fits * _choices(fits, ranks), 0.0))
         return [of_side[k] if k >= 0 else None for k in index], _reasons(fits, index, objects)
 
     boxes = [_rectangle(box, size_hw) if has else None for box, has in zip(box_2d, has_box, strict=True)]
@@ -148,10 +150,13 @@ def assign(
 
 
 def distinct(masks: Sequence[InstanceMask]) -> list[InstanceMask]:
-    """The masks without those that share more than a half with one of their image that has a higher score."""
-    kept: dict[Side, list[InstanceMask]] = {side: [] for side in SIDES}
+    """The masks without those that share more than a half with one of their image and kind that has a higher score.
+
+    There are two kinds, masks of cars and others: segmentations give one instance to several classes.
+    """
+    kept: dict[tuple[Side, bool], list[InstanceMask]] = {(side, kind): [] for side in SIDES for kind in (True, False)}
     for mask in sorted(masks, key=lambda mask: -mask.score):
-        others = kept[mask.side]
+        others = kept[mask.side, mask.is_car]
         box, boxes = (np.array([each.mask_box for each in some]).reshape(-1, 4) for some in ([mask], others))
         near = np.flatnonzero(box_iou(box, boxes)[0] > 0).tolist()
         if not any(others[k].score > mask.score and mask_iou(mask, others[k]) > DUPLICATE_MASK_IOU for k in near):
@@ -163,10 +168,16 @@ def distinct(masks: Sequence[InstanceMask]) -> list[InstanceMask]:
 def hiding(masks: Sequence[InstanceMask], matched: Sequence[InstanceMask]) -> list[InstanceMask]:
     """Those of the masks of no detection that may hide cars.
 
-    One that lies for more than a half on masks of detections shows these, and one whose score is not above one half is
-    as likely no instance at all.
+    One that lies for more than a half on masks of detections shows these, and so does one on which the half of such a
+    mask lies that has no lower score. One whose own score is not above one half is as likely no instance at all.
     """
-    return [mask for mask in masks if mask.score > 0.5 and _share_on(mask, matched) <= 0.5]
+    return [
+        mask
+        for mask in masks
+        if mask.score > 0.5
+        and _share_on(mask, matched) <= 0.5
+        and not any(_share_on(other, [mask]) > 0.5 for other in matched if other.score >= mask.score)
+    ]
 
 
 def _share_on(mask: InstanceMask, others: Sequence[InstanceMask]) -> float:
@@ -232,12 +243,12 @@ def mask_iou(a: InstanceMask, b: InstanceMask) -> float:
 
 def _choices(
     fits: NDArray[np.float64],  # (B, M)
-    scores: NDArray[np.float64],  # (B,) of the objects
+    ranks: NDArray[np.float64],  # (B,) of the objects: scores, those of objects that are refined above all others
 ) -> NDArray[np.float64]:  # (B, M)
-    """One, and less where a mask fits an object of a higher score nearly as well: there are two boxes of one car."""
+    """One, and less where a mask fits an object of a higher rank nearly as well: there are two boxes of one car."""
     factors = np.ones_like(fits)
-    for row, score in enumerate(scores.tolist()):
-        better = fits[scores > score]
+    for row, rank in enumerate(ranks.tolist()):
+        better = fits[ranks > rank]
         if len(better):
             factors[row] = np.where(better.max(axis=0) >= _NEARLY * fits[row], _SECOND_CHOICE, 1.0)
     return factors

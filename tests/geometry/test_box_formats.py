@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import get_args
 
 import pytest
 import torch
@@ -193,3 +194,20 @@ def test_a_pitched_sensor_gives_a_pitched_car_and_each_box_may_have_its_motion()
     T_cam_obj, hwl = boxes_to_poses(boxes, "mmdet3d_lidar", motions)
     torch.testing.assert_close(T_cam_obj[1], pitch @ T_cam_obj[0])
     torch.testing.assert_close(poses_to_boxes(T_cam_obj, hwl, "mmdet3d_lidar", motions), boxes)
+
+
+@pytest.mark.parametrize("convention", get_args(BoxFormat))
+def test_headings_in_degrees_are_refused(convention: BoxFormat) -> None:
+    boxes = torch.tensor([[1.0, 1.0, 20.0, 1.5, 1.6, 4.0, 2.9], [1.0, 1.0, 20.0, 1.5, 1.6, 4.0, -90.5]])
+    T_cam_boxes = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    with pytest.raises(InputError, match=r"boxes: expected headings in radians.* -90\.5\] in row 1; .*deg2rad"):
+        boxes_to_poses(boxes, convention, T_cam_boxes)
+    boxes_to_poses(boxes[:1], convention, T_cam_boxes)
+
+
+def test_one_motion_may_have_the_axis_of_frames() -> None:
+    boxes, T = torch.tensor([[1.0, 1.0, 20.0, 1.5, 1.6, 4.0, 2.9]]).expand(3, 7), torch.eye(4)
+    T[0, 3] = 0.06
+    expected = boxes_to_poses(boxes, "kitti", T)[0]
+    assert boxes_to_poses(boxes, "kitti", T[None])[0].equal(expected)
+    assert boxes_to_poses(boxes, "kitti", T.expand(3, 4, 4))[0].equal(expected)

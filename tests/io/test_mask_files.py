@@ -215,6 +215,18 @@ def test_instance_png_of_the_left_images_alone(tmp_path: Path) -> None:
         mask_source(tmp_path / "instance_2").read("000000", SIZE_HW)
 
 
+@pytest.mark.parametrize("number", [0.5, True, "x", None, [1]])
+def test_an_image_id_that_is_no_number_of_a_frame_is_named(tmp_path: Path, number: Any) -> None:
+    path = write_json(tmp_path / "l.json", [entry(image_id=number)])
+    with pytest.raises(DataFormatError, match=r"entry 0: 'image_id' is .*, expected the frame's number"):
+        CocoFileMasks(path, None).read("000001", SIZE_HW)
+
+
+def test_a_score_that_is_null_is_none(tmp_path: Path) -> None:
+    write_json(tmp_path / "000000.json", [entry(image="left", score=None)])
+    assert [mask.score for mask in FrameJsonMasks(tmp_path).read("000000", SIZE_HW)] == [1.0]
+
+
 def test_plain_coco_files_of_a_whole_data_set(tmp_path: Path) -> None:
     left = write_json(tmp_path / "l.json", [entry(image_id=8), entry(image_id=107), entry(image_id="8")])
     right = write_json(tmp_path / "r.json", [entry(image_id=107)])

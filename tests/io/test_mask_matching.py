@@ -162,6 +162,24 @@ def test_objects_of_other_classes_keep_their_masks() -> None:
     assert numbers(matched([car(1, 0.0, 15.0, kind="Van")], [walker]).left) == [1]
 
 
+def test_the_same_pixels_as_another_class_take_no_mask_away() -> None:
+    """Segmentations give one instance to several classes, and detectors one object."""
+    seen_twice = [seen(0.0, 15.0, number=1, score=0.9), seen(0.0, 15.0, number=2, score=0.97, is_car=False)]
+    for masks in (seen_twice, seen_twice[::-1]):
+        assert numbers(matched([car(1, 0.0, 15.0)], masks).left) == [1]
+        assert hiding(masks, [seen_twice[0]]) == []
+    objects = [car(1, 0.0, 15.0, kind="Pedestrian", score=0.99), car(2, 0.3, 15.0, score=0.5)]
+    for some in (objects, objects[::-1]):
+        found = dict(zip([o.type for o in some], numbers(matched(some, [seen_twice[0]]).left), strict=True))
+        assert found == {"Pedestrian": -1, "Car": 1}
+
+
+def test_a_larger_false_mask_hides_no_car_of_a_better_one() -> None:
+    true, false = square((100, 50, 200, 100), score=0.95), square((70, 35, 230, 115), score=0.6)
+    assert hiding([false], [true]) == []
+    assert hiding([replace(false, score=0.99)], [true]) != []
+
+
 def test_the_right_mask_of_a_hidden_car_is_found_by_way_of_the_left_one() -> None:
     """A quarter of a car is seen in both images, and what hides it has no mask."""
     parts = [seen(0.0, 15.0, side, part=(0.0, 0.25)) for side in ("left", "right")]  # type: ignore[arg-type]
