@@ -37,6 +37,7 @@ from directshape_torch.scene_check.finding import Finding, found, names, unreada
 from directshape_torch.scene_check.words import Words, words_of_files
 
 _Part = TypeVar("_Part")
+_SOME_MASKS = 3
 
 
 class _Attempts:
@@ -160,7 +161,7 @@ def _evidence(
     around = {side: _columns([mask.mask_box for mask in of_side], 4) for side, of_side in of_cars.items()}
     overlap = {side: np.nan_to_num(box_iou(expected, around[side])) for side in SIDES}
     matches = {side: assign(np.where(each >= MIN_OVERLAP, each, 0.0)) for side, each in overlap.items()}
-    rows = _telling(cars, matches["left"])
+    rows = _telling(cars, matches["left"], boxes.box_2d)
     own = {side: [None if (k := matches[side][row]) < 0 else of_cars[side][k] for row in rows] for side in SIDES}
     nothing = (np.nan,) * 4
     return FrameEvidence(
@@ -192,10 +193,20 @@ def _own_boxes(cars: Sequence[KittiObject]) -> NDArray[np.float64]:
     return np.where(is_none[:, None], 0.0, boxes)
 
 
-def _telling(cars: Sequence[KittiObject], masks_left: Sequence[int]) -> list[int]:
-    """The cars that tell most, as `Detections.telling_rows` chooses them."""
-    order = sorted(range(len(cars)), key=lambda row: (masks_left[row] < 0, -(cars[row].score or 0.0)))
-    return sorted(order[:MOST_TELLING])
+def _telling(
+    cars: Sequence[KittiObject],
+    masks_left: Sequence[int],
+    boxes_2d: NDArray[np.float64],  # (N, 4)
+) -> list[int]:
+    """The cars that tell most, as `Detections.telling_rows` chooses them.
+
+    Where some have a mask, those that have neither a mask nor a 2D box tell nothing: lists that are written down to low
+    scores are full of boxes without a car.
+    """
+    known = (boxes_2d != 0).any(axis=1) | (np.array(masks_left, dtype=np.int64) >= 0)
+    some = sum(mask >= 0 for mask in masks_left) >= _SOME_MASKS
+    rows = [row for row in range(len(cars)) if known[row] or not some]
+    return sorted(sorted(rows, key=lambda row: (masks_left[row] < 0, -(cars[row].score or 0.0)))[:MOST_TELLING])
 
 
 def _columns(rows: Sequence[tuple[float, ...]], count: int) -> NDArray[np.float64]:

@@ -14,6 +14,8 @@ from directshape_torch.scene_check.finding import Finding, Severity, found, of_c
 
 # Mean overlap of masks and 2D boxes, over as many pairs as there could be.
 OVERLAP_ERROR, OVERLAP_WARNING = 0.3, 0.37
+# Those of the right images lie farther left by the disparity.
+OVERLAP_RIGHT = 0.15
 # A detector may well miss all of three cars.
 MIN_PAIRS = 4
 # How much better the right masks must fit the left boxes.
@@ -48,6 +50,9 @@ def check_masks(frames: Sequence[FrameEvidence]) -> list[Finding]:
     if left <= OVERLAP_WARNING:
         enough = sum(_pairs(frame) for frame in frames) >= MIN_PAIRS
         return [_mismatch("error" if left < OVERLAP_ERROR and enough else "warning", "all frames", left)]
+    if sum(_pairs(frame, "right") for frame in frames) >= MIN_PAIRS and right < OVERLAP_RIGHT:
+        measured = f"right masks and 2D boxes of cars overlap by {right:.2f} in the mean, left ones by {left:.2f}"
+        return [found("masks_elsewhere", "all frames", measured, severity="warning", limit=OVERLAP_RIGHT)]
     # Single frames whose masks are those of another, among others that are right.
     overlaps = {frame.frame_id: _mean_overlap([frame], "left") for frame in frames if _pairs(frame) > 1}
     wrong = {frame_id: overlap for frame_id, overlap in overlaps.items() if overlap < OVERLAP_ERROR}

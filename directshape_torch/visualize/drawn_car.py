@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     import trimesh
 
 
+# More cars make a picture unreadable; farther is none.
+_MOST_CARS, _FARTHEST_M = 60, 1e6
+
+
 @dataclass(frozen=True)
 class DrawnCar:
     """A car in one state, in the left camera frame."""
@@ -63,11 +67,23 @@ def is_refined(status: str) -> bool:
     return status in Status.__members__ and Status[status].is_refined
 
 
-def drawn_cars(loaded: LoadedFrame, result: RefinementResult) -> tuple[list[DrawnCar], list[DrawnCar]]:
-    """The cars of a refined frame before and after."""
-    objects, t_cam_ref = loaded.detected_objects, loaded.frame.camera.t_cam_ref[0]
+def drawn_cars(
+    loaded: LoadedFrame,
+    result: RefinementResult,
+    cars: Tensor | None = None,  # (M,) rows
+) -> tuple[list[DrawnCar], list[DrawnCar]]:
+    """The cars of a refined frame, or some of them, before and after."""
+    cars = torch.arange(len(result)) if cars is None else cars
+    objects, t_cam_ref = [loaded.detected_objects[row] for row in cars.tolist()], loaded.frame.camera.t_cam_ref[0]
     before = cars_before(objects, t_cam_ref, mean_car(result.prior), result.code.shape[1])
-    return before, cars_of_result(result, [one.line_number for one in objects], before)
+    return before, cars_of_result(result.rows(cars), [one.line_number for one in objects], before)
+
+
+def most_telling(result: RefinementResult, cars: Tensor) -> Tensor:
+    """Some cars, rows (M,), in their order; of more than 60 the refined ones first, then the nearest."""
+    depth, refined = (x.detach().cpu()[cars] for x in (result.T_cam_obj[:, 2, 3], result.refined))
+    order = torch.argsort(depth.abs().nan_to_num(nan=_FARTHEST_M) + torch.where(refined, 0.0, _FARTHEST_M), stable=True)
+    return cars[order[:_MOST_CARS].sort().values]
 
 
 def cars_of_tensors(

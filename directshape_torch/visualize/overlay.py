@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from numbers import Integral
 
 import numpy as np
+import torch
 
 from directshape_torch.errors import InputError, shown
 from directshape_torch.io.stereo_dataset import LoadedFrame
@@ -32,7 +33,7 @@ from directshape_torch.visualize.drawing import (
     draw_text,
     titled,
 )
-from directshape_torch.visualize.drawn_car import DrawnCar, cars_of_tensors, drawn_cars, true_corners
+from directshape_torch.visualize.drawn_car import DrawnCar, cars_of_tensors, drawn_cars, most_telling, true_corners
 
 _LEAST_WIDTH_PX = 1000
 _BIRDS_EYE_WIDTH_PX = 560
@@ -47,7 +48,8 @@ def overlay(frames: FrameBatch, detections: Detections, result: RefinementResult
 
     It shows what `refine --overlays` draws of files: contours and boxes in the left image, each car enlarged, and all
     cars from above. Cars have the numbers of their rows in the call, as in `print(result)`; those that were not refined
-    are grey, and one whose detected box is not finite is left out.
+    are grey, and one whose detected box is not finite is left out. Of more than 60 cars the refined ones come first,
+    then the nearest.
 
     Args:
         frames: what the refiner was given, F frames.
@@ -82,14 +84,14 @@ def overlay(frames: FrameBatch, detections: Detections, result: RefinementResult
         raise InputError("frame", f"a number of 0..{len(frames) - 1}", shown(frame))
     drawable = detections.T_cam_obj.isfinite().flatten(1).all(dim=1) & detections.dimensions_hwl.isfinite().all(dim=1)
     cars = ((detections.frame_index == frame) & drawable.to(detections.frame_index.device)).nonzero().flatten().cpu()
-    before, after = cars_of_tensors(detections, result, cars)
+    before, after = cars_of_tensors(detections, result, most_telling(result, cars))
     view = View.of_frame(frames, number=int(frame))
     return overlay_picture(view, before, after, title=f"frame {frames.frame_ids[frame]}")
 
 
 def overlay_of_frame(loaded: LoadedFrame, result: RefinementResult) -> Picture:
     """The picture (h, w, 3), RGB, of a refined frame."""
-    before, after = drawn_cars(loaded, result)
+    before, after = drawn_cars(loaded, result, most_telling(result, torch.arange(len(result))))
     classes = [one.type for one in loaded.detected_objects]
     truth = true_corners(loaded.labels, classes, loaded.frame.camera.t_cam_ref[0])
     return overlay_picture(View.of_frame(loaded.frame), before, after, truth, f"frame {loaded.frame_id}")

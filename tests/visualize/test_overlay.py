@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from helpers.ellipsoids import ellipsoid_prior
 from helpers.synthetic_scene import cached_street, disturbed, joined_frames
 
 import directshape_torch
@@ -22,8 +23,9 @@ from directshape_torch import (
 )
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.stereo_dataset import open_dataset
+from directshape_torch.status import Status
 from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Array, Picture, View
-from directshape_torch.visualize.drawn_car import DrawnCar
+from directshape_torch.visualize.drawn_car import DrawnCar, most_telling
 from directshape_torch.visualize.overlay import draw_footprint, ground_view, overlay, overlay_of_frame, overlay_picture
 
 P = np.array([[700.0, 0.0, 500.0, 0.0], [0.0, 700.0, 150.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
@@ -157,3 +159,18 @@ def test_what_does_not_belong_together_is_refused() -> None:
             overlay(frames, detections, result, frame)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="detections: expected a Detections, got RefinementResult"):
         overlay(frames, result, detections)  # type: ignore[arg-type]
+
+
+def test_of_many_cars_the_refined_ones_are_drawn_and_then_the_nearest() -> None:
+    """Detectors that write down whatever they have fill a frame with thousands of boxes."""
+    _, scene = cached_street()
+    result = DirectShapeRefiner(ellipsoid_prior(), load_config("fast"))(scene.frames, scene.detections)
+    rows = torch.tensor([0, 1] * 50)
+    many = result[rows]
+    many.status_code[:] = Status.no_mask.code
+    many.status_code[97] = result.status_code[1]
+    chosen = most_telling(many, torch.arange(100)).tolist()
+    assert len(chosen) == 60
+    assert 97 in chosen
+    assert set(range(0, 100, 2)) <= set(chosen)  # the nearer of the two cars
+    assert most_telling(result, torch.arange(2)).tolist() == [0, 1]
