@@ -99,9 +99,10 @@ def evidence_of_scene(frames: FrameBatch, detections: Detections, words: Words |
 def reread_boxes(masks: Iterable[NDArray[np.bool_]]) -> dict[str, Floats]:
     """Boxes around masks (H, W) whose file was written in another order of pixels than it was read in.
 
-    Run lengths go down the columns; read so, those that went along the rows are scattered over the whole image.
+    Run lengths go down the columns; read so, those that went along the rows are scattered over the whole image. Masks
+    without a pixel, as those of NaN, have no box.
     """
-    whole = list(masks)
+    whole = [mask for mask in masks if mask.any()]
     row_by_row = [_box_around(mask.T.reshape(mask.shape)) for mask in whole]
     exchanged = [_box_around(mask)[[1, 0, 3, 2]] for mask in whole]
     boxes = {"row by row": row_by_row, "with rows and columns exchanged": exchanged}
