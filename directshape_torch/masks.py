@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
 from typing import Annotated, Any, Self, Union
 
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.errors import InputError
+from directshape_torch.errors import InputError, shown
 from directshape_torch.numerics.checks import check_shape
 from directshape_torch.numerics.conversion import Given, as_tensor
 from directshape_torch.numerics.records import Dense, TensorRecord
@@ -53,8 +55,9 @@ class MaskCrops(TensorRecord):
     def __post_init__(self) -> None:
         super().__post_init__()
         height, width = self.size_hw
+        object.__setattr__(self, "size_hw", (height, width))
         fits = all(0 <= u0 <= u1 <= width and 0 <= v0 <= v1 <= height for u0, v0, u1, v1 in self._boxes)
-        if not fits or sum(self._counts) != len(self.values):
+        if not fits or self._starts[-1] != len(self.values):
             expected = f"half open boxes within {width} x {height} pixels that have {len(self.values)} pixels together"
             raise InputError("boxes", expected, str(self._boxes), "make crops with MaskCrops.of")
 
@@ -64,8 +67,8 @@ class MaskCrops(TensorRecord):
 
         Args:
             masks: (B, H, W) or B entries that are (H, W) or None, tensors or numpy arrays, or crops: bool, uint8 (0 and
-                1, or 0..255), or foreground probability. Masks that require gradients are kept whole, for zeros have
-                one too.
+                1 where nothing in the array is larger, else 0..255), or foreground probability. Masks that require
+                gradients are kept whole, for zeros have one too.
             present: (B,) bool, masks that are there; the others are not read. None: all of them are there.
             name: of the argument, for errors.
 
@@ -73,41 +76,33 @@ class MaskCrops(TensorRecord):
             InputError: no masks of one size, another dtype, or values above 1.5.
         """
         if isinstance(masks, cls):
-            return masks if present is None else masks.where(as_tensor(present))
-        masks = masks if isinstance(masks, (list, tuple)) else as_tensor(masks)
-        entries = _entries(name, masks)
-        exists = [True] * len(entries)
-        if present is not None:
-            present = as_tensor(present)
-            check_shape(f"has_{name}", present, (len(entries),), kind="flags")
-            exists = present.tolist()
-        used = [mask if here else None for mask, here in zip(entries, exists, strict=True)]
-        like = next(mask for mask in (*entries, masks) if isinstance(mask, Tensor))
-        boxes = [(0, 0, 0, 0) if mask is None else _support(mask) for mask in used]
-        values = [
-            _checked(name, row, mask[v0:v1, u0:u1])
-            for row, (mask, (u0, v0, u1, v1)) in enumerate(zip(used, boxes, strict=True))
-            if mask is not None
-        ]
+            return masks if present is None else masks.where(_flags(name, present, len(masks)))
+        masks = _foreground_of(name, masks)
+        present = torch.ones(len(masks), dtype=torch.bool) if present is None else _flags(name, present, len(masks))
+        entries = [mask if here else None for mask, here in zip(masks, present.tolist(), strict=True)]
+        known = iter(_supports([mask for mask in entries if mask is not None]))
+        boxes = [[0, 0, 0, 0] if mask is None else next(known) for mask in entries]
+        like = next(mask for mask in (*masks, masks) if isinstance(mask, Tensor))
         height, width = (int(n) for n in like.shape[-2:])
-        return cls(
-            torch.cat([part.reshape(-1) for part in values]) if values else like.new_zeros(0),
-            torch.tensor(boxes, dtype=torch.int64, device=like.device).reshape(-1, 4),
-            (height, width),
-        )
+        parts = [mask[v0:v1, u0:u1] for mask, (u0, v0, u1, v1) in zip(entries, boxes, strict=True) if mask is not None]
+        return cls._checked(name, parts, boxes, (height, width), like)
 
     @classmethod
-    def of_boxes(cls, crops: Sequence[tuple[Sequence[int], Tensor]], size_hw: tuple[int, int], like: Tensor) -> Self:
+    def of_boxes(
+        cls, crops: Sequence[tuple[Given, Tensor | NDArray[Any]]], size_hw: tuple[int, int], like: Tensor
+    ) -> Self:
         """Masks that are known inside of boxes alone, as mask heads give them.
 
         Args:
             crops: of each instance the box u0, v0, u1, v1, half open, whole pixels within the image, and the mask
-                (v1 - v0, u1 - u0) in it; a box without an area for an instance without a mask.
+                (v1 - v0, u1 - u0) in it, of the dtypes that `of` takes; a box without an area for an instance without a
+                mask.
             size_hw: height and width of the images, pixels.
-            like: gives dtype and device.
+            like: gives dtype, in floating point where a mask is soft, and device.
 
         Raises:
-            InputError: a box that leaves the image, or a mask of another size than its box.
+            InputError: a box that leaves the image or is not in whole pixels, a mask of another size than its box,
+                another dtype, or values above 1.5.
 
         Examples:
             >>> head = torch.rand(1, 1, 28, 28)
@@ -115,9 +110,33 @@ class MaskCrops(TensorRecord):
             >>> MaskCrops.of_boxes([((100, 50, 180, 80), inside)], (120, 400), head).dense().shape
             torch.Size([1, 120, 400])
         """
-        values = [pixels.reshape(-1).to(like) for _, pixels in crops]
-        boxes = torch.tensor([list(box) for box, _ in crops], dtype=torch.int64, device=like.device)
-        return cls(torch.cat(values) if values else like.new_zeros(0), boxes.reshape(-1, 4), size_hw)
+        boxes = [_whole_box(f"crops[{row}]", box) for row, (box, _) in enumerate(crops)]
+        parts = [as_tensor(pixels) for _, pixels in crops]
+        for row, ((u0, v0, u1, v1), part) in enumerate(zip(boxes, parts, strict=True)):
+            _check_mask(f"crops[{row}]", part, (v1 - v0, u1 - u0), "the mask is (v1 - v0, u1 - u0) of its box")
+        parts = _foreground(parts)
+        check_shape("like", like, [f"n{axis}" for axis in range(like.ndim)], kind="mask")
+        if like.dtype == torch.bool and any(part.is_floating_point() and part.numel() for part in parts):
+            raise InputError("like", "floating point, which soft masks need", str(like.dtype), "give a float tensor")
+        return cls._checked("crops", [part.to(like) for part in parts], boxes, size_hw, like)
+
+    @classmethod
+    def _checked(
+        cls, name: str, parts: Sequence[Tensor], boxes: list[list[int]], size_hw: tuple[int, int], like: Tensor
+    ) -> Self:
+        """Crops of the pixels in B boxes; raises `InputError` where they are other numbers than probabilities."""
+        values = torch.cat([part.reshape(-1) for part in parts]) if parts else like.new_zeros(0)
+        crops = cls(values, torch.tensor(boxes, dtype=torch.int64, device=like.device).reshape(-1, 4), size_hw)
+        if values.dtype != torch.bool and values.numel():
+            known = values.detach().nan_to_num(0.0, posinf=torch.inf, neginf=-torch.inf)
+            lowest, highest = torch.stack(known.aminmax()).tolist()
+            if highest > _HIGHEST_PROBABILITY or lowest < _LOWEST_PROBABILITY:
+                value = highest if highest > _HIGHEST_PROBABILITY else lowest
+                row = bisect_right(crops._starts, int((known == value).int().argmax())) - 1
+                cure = "apply a sigmoid to logits, or divide by 255"
+                got = f"a value of {value:g} in mask {row}"
+                raise InputError(name, "foreground probabilities in [0, 1]", got, cure)
+        return crops
 
     @classmethod
     def none(cls, count: int, size_hw: tuple[int, int], like: Tensor) -> Self:
@@ -139,7 +158,8 @@ class MaskCrops(TensorRecord):
     def crop(self, row: int) -> Tensor:
         """The pixels (h, w) of one mask inside its box."""
         u0, v0, u1, v1 = self._boxes[row]
-        return self._parts[row].view(v1 - v0, u1 - u0)
+        # Made anew each time: a view that is kept from a region without gradients would have none later.
+        return self.values.narrow(0, self._starts[row], (v1 - v0) * (u1 - u0)).view(v1 - v0, u1 - u0)
 
     def dense(self) -> Tensor:
         """All masks (B, H, W), zero where there is none."""
@@ -157,14 +177,14 @@ class MaskCrops(TensorRecord):
 
     def rows(self, index: Tensor) -> Self:
         """The masks `index` (M,) int64, in that order."""
-        parts = [self._parts[row] for row in index.tolist()]
+        parts = [self.crop(row).view(-1) for row in index.tolist()]
         values = torch.cat(parts) if parts else self.values[:0]
         return type(self)(values, self.boxes.index_select(0, index.to(self.boxes.device)), self.size_hw)
 
     def where(self, present: Tensor) -> Self:
         """The masks where `present` (B,) holds; the other instances have none."""
-        parts = [part if here else part[:0] for part, here in zip(self._parts, present.tolist(), strict=True)]
-        values = torch.cat(parts) if parts else self.values
+        parts = [self.crop(row).view(-1) for row, here in enumerate(present.tolist()) if here]
+        values = torch.cat(parts) if parts else self.values[:0]
         return type(self)(values, self.boxes * present[:, None].to(self.boxes), self.size_hw)
 
     def padded(self, size_hw: tuple[int, int]) -> Self:
@@ -188,12 +208,12 @@ class MaskCrops(TensorRecord):
 
     @property
     def extents(self) -> Tensor:
-        """Boxes (B, 4) int64 around the pixels above one half, half open, 0 without any; a NaN is above."""
+        """Boxes (B, 4) int64 around the pixels above one half, half open, 0 without any; NaN counts as above."""
         return self._foreground[0]
 
     @property
     def areas(self) -> Tensor:
-        """Pixels (B,) above one half; a NaN is above."""
+        """Numbers (B,) of pixels above one half; NaN counts as above."""
         return self._foreground[1]
 
     @cached_property
@@ -201,28 +221,32 @@ class MaskCrops(TensorRecord):
         return self.boxes.tolist()
 
     @cached_property
-    def _counts(self) -> list[int]:
-        return [(u1 - u0) * (v1 - v0) for u0, v0, u1, v1 in self._boxes]
-
-    @cached_property
-    def _parts(self) -> tuple[Tensor, ...]:
-        return torch.split(self.values, self._counts) if self._counts else ()
+    def _starts(self) -> list[int]:
+        """Places of the first pixel of each box among the values, and their number."""
+        return [0, *accumulate((u1 - u0) * (v1 - v0) for u0, v0, u1, v1 in self._boxes)]
 
     @cached_property
     def _first(self) -> Tensor:
         """Place (B,) of the first pixel of each box among the values."""
-        counts = torch.tensor(self._counts, dtype=torch.int64, device=self.boxes.device)
-        return counts.cumsum(0) - counts
+        return torch.tensor(self._starts[:-1], dtype=torch.int64, device=self.boxes.device)
 
     @cached_property
     def _foreground(self) -> tuple[Tensor, Tensor]:
         crops = [~(self.crop(row).detach() <= MASK_THRESHOLD) for row in range(len(self))]
-        if not crops:
-            return self.boxes.long(), self.boxes[:, 0].long()
         boxes = self.boxes.long()
-        u0, u1 = _first_and_end([crop.any(dim=0) for crop in crops], boxes[:, 0])
-        v0, v1 = _first_and_end([crop.any(dim=1) for crop in crops], boxes[:, 1])
-        return torch.stack([u0, v0, u1, v1], dim=1), torch.stack([crop.sum() for crop in crops])
+        if not crops:
+            return boxes, boxes[:, 0]
+        return _extents(crops, boxes[:, :2]), torch.stack([crop.sum() for crop in crops])
+
+
+def _extents(
+    crops: Sequence[Tensor],  # B of (h, w)
+    corners: Tensor,  # (B, 2) u and v of the upper left pixel of each
+) -> Tensor:
+    """Boxes (B, 4) int64 around what is not zero, half open, 0 without any."""
+    u0, u1 = _first_and_end([crop.any(dim=0) for crop in crops], corners[:, 0])
+    v0, v1 = _first_and_end([crop.any(dim=1) for crop in crops], corners[:, 1])
+    return torch.stack([u0, v0, u1, v1], dim=1)
 
 
 def _first_and_end(
@@ -241,61 +265,66 @@ def _first_and_end(
     return torch.where(first == beyond, 0, first), end
 
 
-def _entries(name: str, masks: Masks) -> list[Tensor | None]:
-    """Each mask (H, W) in bool or floating point, or None."""
+def _flags(name: str, present: Given, count: int) -> Tensor:
+    """Which masks (B,) are there."""
+    flags = as_tensor(present)
+    # An empty list says nothing of its dtype.
+    flags = flags.bool() if isinstance(flags, Tensor) and flags.shape == (0,) else flags
+    check_shape(f"has_{name}", flags, (count,), kind="flags")
+    return flags
+
+
+def _foreground_of(name: str, masks: Masks) -> Tensor | list[Tensor | None]:
+    """Masks (B, H, W), or B that are (H, W) or None, in bool or floating point."""
+    masks = masks if isinstance(masks, (list, tuple)) else as_tensor(masks)
     if isinstance(masks, Tensor):
-        check_shape(name, masks, ("B", "H", "W"))
-        return list(_foreground(name, masks))
+        _check_mask(name, masks, ("B", "H", "W"))
+        return _foreground([masks])[0]
     if not isinstance(masks, (list, tuple)):
         expected = "masks (B, H, W), or B entries that are (H, W) or None"
         raise InputError(name, expected, type(masks).__name__, "stack the masks of the cars")
-    entries: list[Tensor | None] = []
-    for row, mask in enumerate(masks):
-        if mask is None:
-            entries.append(None)
-            continue
-        tensor = as_tensor(mask)
-        check_shape(f"{name}[{row}]", tensor, ("H", "W"))
-        entries.append(_foreground(f"{name}[{row}]", tensor))
-    sizes = {tuple(mask.shape) for mask in entries if mask is not None}
+    given = {row: as_tensor(mask) for row, mask in enumerate(masks) if mask is not None}
+    for row, mask in given.items():
+        _check_mask(f"{name}[{row}]", mask, ("H", "W"))
+    sizes = {tuple(mask.shape) for mask in given.values()}
     if len(sizes) != 1:
-        got = f"{len(entries)} entries of sizes {sorted(sizes)}"
+        got = f"{len(masks)} entries of sizes {sorted(sizes)}"
         cure = "where no car has a mask give MaskCrops.none(number of cars, (H, W), like=boxes)"
         raise InputError(name, "masks of one size (H, W), or None where a car has none", got, cure)
-    dtypes = {mask.dtype for mask in entries if mask is not None}
-    if len(dtypes) > 1:
-        entries = [None if mask is None else mask.float() for mask in entries]
-    return entries
+    found = dict(zip(given, _foreground(list(given.values())), strict=True))
+    return [found.get(row) for row in range(len(masks))]
 
 
-def _foreground(name: str, masks: Tensor) -> Tensor:
+def _check_mask(name: str, mask: Tensor, shape: Sequence[int | str], cure: str = "") -> None:
+    """Raise `InputError` unless this is a mask, of bytes or of what a mask may be in a call."""
+    is_bytes = isinstance(mask, Tensor) and mask.dtype == torch.uint8
+    check_shape(name, mask, shape, cure, "number" if is_bytes else "mask")
+
+
+def _foreground(masks: Sequence[Tensor]) -> list[Tensor]:
     """Masks in bytes, 0 and 1 or shades of grey, as bool or probabilities; others as they are."""
-    if masks.dtype == torch.uint8:
-        return masks.bool() if not masks.numel() or int(masks.max()) <= 1 else masks.float() / 255
-    check_shape(name, masks, [f"n{axis}" for axis in range(masks.ndim)], kind="mask")
-    return masks
+    is_bytes = [mask.dtype == torch.uint8 for mask in masks]
+    shades = [(mask > 1).any() for mask, here in zip(masks, is_bytes, strict=True) if here]
+    is_grey = iter(torch.stack(shades).tolist() if shades else [])
+    return [
+        mask if not here else mask.float() / 255 if next(is_grey) else mask.bool()
+        for mask, here in zip(masks, is_bytes, strict=True)
+    ]
 
 
-def _support(mask: Tensor) -> tuple[int, int, int, int]:
-    """The box u0, v0, u1, v1 around what is not zero; the whole image where gradients are asked of the zeros."""
-    if mask.requires_grad:
-        return 0, 0, mask.shape[1], mask.shape[0]
-    on = mask if mask.dtype == torch.bool else mask != 0
-    rows = on.any(dim=1).nonzero()[:, 0].tolist()
-    if not rows:
-        return 0, 0, 0, 0
-    top, bottom = rows[0], rows[-1] + 1
-    columns = on[top:bottom].any(dim=0).nonzero()[:, 0].tolist()
-    return columns[0], top, columns[-1] + 1, bottom
+def _whole_box(name: str, box: Given) -> list[int]:
+    """A box u0, v0, u1, v1, half open; raises `InputError` where this is none in whole pixels."""
+    numbers = as_tensor(box).tolist()
+    fits = len(numbers) == 4 and all(float(number).is_integer() for number in numbers)
+    if not fits or numbers[2] < numbers[0] or numbers[3] < numbers[1]:
+        expected = "a box u0, v0, u1, v1 in whole pixels, half open"
+        raise InputError(name, expected, shown(numbers), "round its corners before you resample the mask to its size")
+    return [int(number) for number in numbers]
 
 
-def _checked(name: str, row: int, mask: Tensor) -> Tensor:
-    """The mask itself; raises `InputError` where it holds other numbers than probabilities."""
-    if mask.dtype != torch.bool and mask.numel():
-        known = mask.detach().nan_to_num(0.0, posinf=torch.inf, neginf=-torch.inf)
-        lowest, highest = (float(value) for value in known.aminmax())
-        if highest > _HIGHEST_PROBABILITY or lowest < _LOWEST_PROBABILITY:
-            got = f"a value of {highest if highest > _HIGHEST_PROBABILITY else lowest:g} in mask {row}"
-            cure = "apply a sigmoid to logits, or divide by 255"
-            raise InputError(name, "foreground probabilities in [0, 1]", got, cure)
-    return mask
+def _supports(masks: Sequence[Tensor]) -> list[list[int]]:
+    """Boxes u0, v0, u1, v1 around what is not zero; the whole image where gradients are asked of the zeros."""
+    plain = [mask for mask in masks if not mask.requires_grad]
+    # One wait for the device for all of them.
+    found = iter(_extents(plain, plain[0].new_zeros(len(plain), 2, dtype=torch.int64)).tolist() if plain else [])
+    return [[0, 0, mask.shape[1], mask.shape[0]] if mask.requires_grad else next(found) for mask in masks]

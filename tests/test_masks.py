@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any
 
@@ -128,6 +131,24 @@ def test_zeros_have_gradients_too() -> None:
     assert mask.grad.nonzero().tolist() == [[0, 1, 2], [0, 3, 5]]
 
 
+@pytest.mark.parametrize("look", [torch.no_grad, torch.inference_mode, torch.enable_grad])
+def test_gradients_do_not_depend_on_who_looked_at_the_masks_first(
+    look: Callable[[], AbstractContextManager[Any]],
+) -> None:
+    """Whoever chooses rows by `has_mask_left` does so outside of the graph."""
+    masks = random_masks(3, torch.Generator().manual_seed(5)).nan_to_num(0.7).requires_grad_()
+    crops = MaskCrops.of(masks)
+    with look():
+        crops.rows((crops.areas > 0).nonzero()[:, 0])
+    some = crops.rows(torch.tensor([2, 0]))
+    (some.values.sum() + crops.where(torch.tensor([True, False, False])).dense().sum() + crops[1].sum()).backward()
+    assert masks.grad is not None
+    assert masks.grad.unique(dim=0).tolist() == [[[1.0] * 31] * 23, [[2.0] * 31] * 23]
+    leaf = replace(crops, values=crops.values.detach().requires_grad_())
+    assert leaf.areas.equal(copy.deepcopy(leaf).areas)
+    assert copy.deepcopy(leaf).areas.equal(crops.areas)
+
+
 @pytest.mark.parametrize("value", [1.6, 255.0, torch.inf, -0.6, -20.0, -torch.inf])
 def test_more_than_a_probability_is_named(value: float) -> None:
     masks = torch.zeros(3, 4, 6)
@@ -161,6 +182,58 @@ def test_masks_may_overshoot_by_resampling() -> None:
 def test_what_is_no_mask_is_named(masks: Any, text: str) -> None:
     with pytest.raises(InputError, match=text):
         MaskCrops.of(masks)
+
+
+BOX = (2, 1, 5, 3)
+INSIDE = np.linspace(0.1, 1.0, 6, dtype=np.float32).reshape(2, 3)
+
+
+@pytest.mark.parametrize(
+    ("box", "pixels", "expected"),
+    [
+        (BOX, INSIDE, INSIDE),
+        (torch.tensor(BOX), torch.from_numpy(INSIDE).half(), INSIDE),
+        (np.array(BOX, dtype=np.float64), np.full((2, 3), 100, np.uint8), np.full((2, 3), 100 / 255)),
+        (BOX, np.ones((2, 3), np.uint8), np.ones((2, 3))),
+        (BOX, INSIDE > 0.5, INSIDE > 0.5),
+        ((0, 0, 0, 0), np.zeros((0, 0)), np.zeros((0, 0))),
+    ],
+)
+def test_masks_known_in_boxes_alone(box: Any, pixels: Any, expected: Any) -> None:
+    """The same forms of masks are taken as of whole images."""
+    crops = MaskCrops.of_boxes([(box, pixels)], (4, 6), torch.zeros(1))
+    np.testing.assert_allclose(crops.crop(0).numpy(), expected, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("box", "pixels", "like", "text"),
+    [
+        (BOX, INSIDE.T, torch.zeros(1), r"crops\[1\]: expected shape \(2, 3\), got \(3, 2\); the mask is \(v1 - v0,"),
+        (BOX, INSIDE * 9, torch.zeros(1), r"crops: expected foreground probabilities .* 9 in mask 1; apply a sigmoid"),
+        (BOX, INSIDE.astype(np.int64), torch.zeros(1), r"crops\[1\]: expected bool, or foreground probabilities"),
+        ((2.5, 1, 5, 3), INSIDE, torch.zeros(1), r"crops\[1\]: expected a box u0, v0, u1, v1 in whole pixels.*2.5"),
+        ((2, 1, 5), INSIDE, torch.zeros(1), r"crops\[1\]: expected a box u0, v0, u1, v1 in whole pixels"),
+        ((4, 1, 7, 3), INSIDE, torch.zeros(1), r"boxes: expected half open boxes within 6 x 4 pixels"),
+        ((5, 3, 2, 1), INSIDE, torch.zeros(1), r"crops\[1\]: expected a box u0, v0, u1, v1 in whole pixels"),
+        (BOX, INSIDE, torch.zeros(1, dtype=torch.bool), r"like: expected floating point, .*got torch.bool"),
+        (BOX, INSIDE, torch.zeros(1, dtype=torch.int64), r"like: expected bool, or foreground probabilities"),
+    ],
+)
+def test_what_is_no_mask_of_its_box_is_named(box: Any, pixels: Any, like: Tensor, text: str) -> None:
+    good = ((0, 0, 3, 2), INSIDE)
+    with pytest.raises(InputError, match=text):
+        MaskCrops.of_boxes([good, (box, pixels)], (4, 6), like)
+
+
+@pytest.mark.parametrize("form", [lambda masks: masks, MaskCrops.of])
+def test_flags_are_the_same_for_every_form_of_masks(form: Callable[[Tensor], Any]) -> None:
+    masks = form(random_masks(3, torch.Generator().manual_seed(5)))
+    assert MaskCrops.of(masks, np.array([True, False, True])).areas.tolist()[1] == 0
+    with pytest.raises(InputError, match=r"has_right: expected shape \(3,\), got \(1,\)"):
+        MaskCrops.of(masks, [True], "right")
+    with pytest.raises(InputError, match=r"has_right: expected bool, got torch.int64"):
+        MaskCrops.of(masks, [1, 0, 1], "right")
+    assert len(MaskCrops.of(form(torch.zeros(0, 4, 6)), [])) == 0
 
 
 def test_boxes_must_hold_the_values() -> None:

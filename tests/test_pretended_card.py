@@ -80,6 +80,13 @@ def test_a_whole_call_lets_the_host_wait_some_forty_times(found: dict[str, Any])
     assert not any(place.startswith("aten.index") for place in by_place)
 
 
+def test_many_masks_let_the_host_wait_no_more_often_than_few(found: dict[str, Any]) -> None:
+    waits = _of(found, "waits of masks")
+    assert len(waits) == 5
+    for few, many in waits.values():
+        assert few == many <= 8
+
+
 def test_the_demo_writes_the_same_files(found: dict[str, Any]) -> None:
     demo = _of(found, "demo")
     assert len(demo["names"]) > 5

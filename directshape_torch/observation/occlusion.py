@@ -97,6 +97,4 @@ def _instances(detections: Detections, order: str) -> tuple[Tensor, Tensor, Tens
 def _masks(detections: Detections, side: Side) -> MaskCrops:
     """The masks of all instances."""
     own, others = (detections.mask_left, detections.mask_right)[side == "right"], detections.occluders
-    if others is None:
-        return own.detach()
-    return MaskCrops.joined([own, (others.mask_left, others.mask_right)[side == "right"]]).detach()
+    return own if others is None else MaskCrops.joined([own, (others.mask_left, others.mask_right)[side == "right"]])

@@ -23,6 +23,7 @@ from torch import Tensor
 from directshape_torch.cli.main import main as command
 from directshape_torch.config import RefinerConfig
 from directshape_torch.io.config_files import load_config
+from directshape_torch.masks import MaskCrops
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
@@ -148,6 +149,26 @@ def waits_of_blocks(tracks: bool = False) -> dict[str, Any]:
     }
 
 
+def waits_of_masks() -> dict[str, Any]:
+    """How often the host waits while it makes crops of few masks and of many, by their form."""
+
+    forms: dict[str, Callable[[Tensor], Any]] = {
+        "dense": MaskCrops.of,
+        "entries": lambda masks: MaskCrops.of([None, *masks]),
+        "bytes": lambda masks: MaskCrops.of(list((masks * 255).byte())),
+        "boxes": lambda masks: MaskCrops.of_boxes([((0, 0, 10, 8), mask) for mask in masks], (8, 10), masks),
+        "areas and boxes": lambda masks: MaskCrops.of(masks).box_2d,
+    }
+    counts: dict[str, list[int]] = {}
+    for name, make in forms.items():
+        for number in (2, 20):
+            masks = torch.rand(number, 8, 10).to(CARD)
+            with noted_waits() as waits:
+                make(masks)
+            counts.setdefault(name, []).append(len(waits))
+    return counts
+
+
 def waits_of_nothing() -> dict[str, Any]:
     """That what is to be noted is: a program that mixes devices, and one that reads."""
     x = torch.arange(6, device=CARD).view(2, 3)
@@ -188,6 +209,7 @@ CASES: dict[str, Callable[[], Any]] = {
     "tracks, unrolled gradients": lambda: compare(UNROLLED, tracks=True),
     "waits of blocks": waits_of_blocks,
     "waits of blocks of tracks": lambda: waits_of_blocks(tracks=True),
+    "waits of masks": waits_of_masks,
     "the card itself": waits_of_nothing,
     "demo": demo,
 }
