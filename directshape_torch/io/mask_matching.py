@@ -9,7 +9,7 @@ what is in no mask may be hidden by something without one, so that it counts hal
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -44,8 +44,9 @@ class MaskMatches:
     right: list[InstanceMask | None]
     # For each object without a left mask the reason, else "".
     reasons: list[str]
-    # (B, 4) of the left image: the detector's 2D box; where there is none of use that of the mask, else that of the
-    # projected 3D box, and NaN where the image shows nothing of it.
+    # (B, 4) of the left image: the 2D box of the object; where this does not overlap the projected 3D box that of the
+    # mask, else the projected one, and NaN where the image shows nothing of it. Objects of a plain folder without a 2D
+    # box have the projected one as theirs.
     box_2d: NDArray[np.float64]
 
 
@@ -68,11 +69,28 @@ def match_masks(
     """
     own = {(mask.side, mask.row): mask for mask in masks if mask.row is not None}
     outlines = dict(zip(SIDES, _outlines(objects, camera), strict=True))
-    projected = {side: enclosing_boxes(outlines[side], size_hw) for side in SIDES}
-    box_2d, has_box = _box_2d(objects, projected["left"])
+    box_2d, has_box = _box_2d(objects, enclosing_boxes(outlines["left"], size_hw))
     if own:
         left, right = ([own.get((side, o.line_number - 1)) for o in objects] for side in SIDES)
-        return MaskMatches(left, right, ["its entry has no mask" if mask is None else "" for mask in left], box_2d)
+        reasons = ["its entry has no mask" if mask is None else "" for mask in left]
+    else:
+        boxes = [_rectangle(box, size_hw) if has else None for box, has in zip(box_2d, has_box, strict=True)]
+        left, right, reasons = _by_pixels(objects, masks, outlines, boxes, size_hw, classes)
+    # Where the file has no box of use, that of the mask is nearest to what a 2D detector would have found.
+    rows = [row for row, mask in enumerate(left) if mask is not None and not has_box[row]]
+    box_2d[rows] = np.array([of.mask_box for row in rows if (of := left[row])]).reshape(-1, 4)
+    return MaskMatches(left, right, reasons, box_2d)
+
+
+def _by_pixels(
+    objects: Sequence[KittiObject],
+    masks: Sequence[InstanceMask],
+    outlines: Mapping[Side, NDArray[np.float64]],  # (B, P, 2)
+    boxes: Sequence[_Pixels | None],  # of the left image
+    size_hw: tuple[int, int],
+    classes: frozenset[str],
+) -> tuple[list[InstanceMask | None], list[InstanceMask | None], list[str]]:
+    """The left and the right masks of objects, and for those without a left one why."""
     hulls = {side: [_hull(uv, size_hw) for uv in outlines[side]] for side in SIDES}
     is_wanted = [o.type in classes for o in objects]
     # Objects that are refined come before all others, which may be the same seen as another class.
@@ -87,15 +105,10 @@ def match_masks(
         index = assign(np.where(fits >= MIN_OVERLAP, fits * _choices(fits, ranks), 0.0))
         return [of_side[k] if k >= 0 else None for k in index], _reasons(fits, index, objects)
 
-    boxes = [_rectangle(box, size_hw) if has else None for box, has in zip(box_2d, has_box, strict=True)]
     left, reasons = matched("left", [hulls["left"], boxes])
-    shift = projected["right"] - projected["left"]
-    moved = [_moved(mask, dx) for mask, dx in zip(left, shift[:, [0, 2]].mean(axis=1), strict=True)]
+    moved = [_moved(mask, shift, size_hw) for mask, shift in zip(left, _shifts_px(outlines), strict=True)]
     right, _ = matched("right", [hulls["right"], moved])
-    # Where the file has no box of use, that of the mask is nearest to what a 2D detector would have found.
-    rows = [row for row, mask in enumerate(left) if mask is not None and not has_box[row]]
-    box_2d[rows] = np.array([of.mask_box for row in rows if (of := left[row])]).reshape(-1, 4)
-    return MaskMatches(left, right, reasons, box_2d)
+    return left, right, reasons
 
 
 def with_image_boxes(
@@ -295,11 +308,24 @@ def _rectangle(box: NDArray[np.float64], size_hw: tuple[int, int]) -> _Pixels | 
     return _hull(np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]]), size_hw)
 
 
-def _moved(mask: InstanceMask | None, shift_px: float) -> _Pixels | None:
+def _shifts_px(
+    outlines: Mapping[Side, NDArray[np.float64]],  # (B, P, 2), NaN where out of sight
+) -> list[float]:
+    """How far to the right of the left image each object lies in the right one, NaN where out of sight.
+
+    The median of all points, in the image or not: the part of a car in the image alone would tell less.
+    """
+    shifts: list[float] = (
+        torch.from_numpy(outlines["right"] - outlines["left"])[..., 0].nanmedian(dim=1).values.tolist()
+    )
+    return shifts
+
+
+def _moved(mask: InstanceMask | None, shift_px: float, size_hw: tuple[int, int]) -> _Pixels | None:
     """A left mask moved by the disparity of its object; a car shows about the same part of itself in both images."""
     if mask is None or not np.isfinite(shift_px):
         return None
     u, v = mask.corner
-    cut = max(0, -(u + round(shift_px)))
-    inside = mask.inside[:, cut:]
-    return ((max(0, u + round(shift_px)), v), inside) if inside.size else None
+    u += round(np.clip(shift_px, -_FARTHEST_PX, _FARTHEST_PX))
+    inside = mask.inside[:, max(0, -u) : max(0, size_hw[1] - u)]
+    return ((max(0, u), v), inside) if inside.size else None

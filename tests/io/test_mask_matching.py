@@ -25,11 +25,12 @@ Box = tuple[float, float, float, float]
 NO_BOX = (-1.0, -1.0, -1.0, -1.0)
 
 
-def camera() -> StereoCamera:
+def camera(right_cx: float = 300.0) -> StereoCamera:
     K = torch.tensor([[500.0, 0, 300], [0, 500, 100], [0, 0, 1]], dtype=torch.float64)
+    K_right = torch.tensor([[500.0, 0, right_cx], [0, 500, 100], [0, 0, 1]], dtype=torch.float64)
     T_right_cam = torch.eye(4, dtype=torch.float64)
     T_right_cam[0, 3] = -0.5
-    return StereoCamera(K[None], K[None], T_right_cam[None], torch.zeros(1, 3, dtype=torch.float64))
+    return StereoCamera(K[None], K_right[None], T_right_cam[None], torch.zeros(1, 3, dtype=torch.float64))
 
 
 def car(
@@ -110,12 +111,15 @@ def test_boxes_of_the_file_are_not_needed(box_2d: Box | None) -> None:
 
 
 def test_a_2d_box_helps_where_the_3d_box_is_off() -> None:
-    moved = car(1, 0.0, 15.0, projected(1.9, 15.0)[0])
+    moved = car(1, -1.1, 15.0, projected(1.9, 15.0)[0])
     assert numbers(matched([moved], [seen(1.9, 15.0)]).left) == [1]
     far_off = car(1, -1.5, 15.0)
     found = matched([far_off], [seen(1.9, 15.0)])
     assert numbers(found.left) == [-1]
     assert found.reasons[0].startswith("the best mask fits its box by 0.")
+    # What no mask covers of a box counts half: 0.15 / (0.15 + 0.85 / 2).
+    found = matched([car(1, 0.0, 15.0)], [seen(0.0, 15.0, part=(0.0, 0.15))])
+    assert found.reasons[0].startswith("the best mask fits its box by 0.2")
 
 
 @pytest.mark.parametrize("order", [1, -1])
@@ -138,6 +142,9 @@ def test_of_two_boxes_of_a_car_the_score_decides(order: int) -> None:
     assert found.reasons[boxes.index(next(o for o in boxes if o.score == 0.2))] == (
         "its mask belongs to the object of line 1, which fits better or has a higher score"
     )
+    # A higher score does not help a box that the mask fits much worse.
+    beside = [car(1, 1.6, 15.0, score=0.9), car(2, 0.0, 15.0, score=0.2)][::order]
+    assert numbers(matched(beside, [seen(0.0, 15.0)]).left) == [-1, 1][::order]
     # Equal scores leave it to the overlap, and a second mask is free for the second box.
     equal = [car(1, 0.4, 15.0), car(2, 0.0, 15.0)]
     assert numbers(matched(equal, [seen(0.0, 15.0)]).left) == [-1, 1]
@@ -181,10 +188,32 @@ def test_a_larger_false_mask_hides_no_car_of_a_better_one() -> None:
 
 
 def test_the_right_mask_of_a_hidden_car_is_found_by_way_of_the_left_one() -> None:
-    """A quarter of a car is seen in both images, and what hides it has no mask."""
-    parts = [seen(0.0, 15.0, side, part=(0.0, 0.25)) for side in ("left", "right")]  # type: ignore[arg-type]
-    found = matched([car(1, 0.0, 15.0, (10.0, 10.0, 20.0, 20.0))], parts)
+    """A seventh of a car is seen in both images, and what hides it has no mask; its 2D box is around what is seen."""
+    parts = [seen(0.0, 15.0, side, part=(0.0, 0.15)) for side in ("left", "right")]  # type: ignore[arg-type]
+    found = matched([car(1, 0.0, 15.0, parts[0].mask_box)], parts)
     assert numbers(found.left) == numbers(found.right) == [1]
+
+
+def test_the_disparity_of_a_car_at_the_edge_of_the_image_is_that_of_the_whole_car() -> None:
+    """The right image shows more of it; the mask of something behind lies where half of the disparity leads."""
+    left = seen(6.3, 9.0)
+    (u0, v0, u1, v1), shift = map(int, left.mask_box), -round(500 * 0.5 / 9)
+    assert u1 == SIZE_HW[1] - 1
+    own, other = (
+        square((first, v0, last, v1), "right", number)
+        for number, first, last in ((1, u0 + shift, u1 + shift), (2, u1 + shift + 1, u1 + shift // 2))
+    )
+    for masks in ([left, own, other], [left, other, own]):
+        assert numbers(matched([car(1, 6.3, 9.0)], masks).right) == [1]
+
+
+@pytest.mark.parametrize(("x", "z", "right_cx"), [(42.0, 70.0, 330.0), (-42.0, 70.0, 270.0), (-4.5, 6.0, 300.0)])
+def test_a_mask_may_leave_the_right_image_on_either_side(x: float, z: float, right_cx: float) -> None:
+    """Rigs with other principal points on the right show far cars farther right there."""
+    left = seen(x, z)
+    found = match_masks([car(1, x, z)], [left, square((0, 0, 9, 9), "right")], camera(right_cx), SIZE_HW)
+    assert numbers(found.left) == [1]
+    assert numbers(found.right) == [-1]
 
 
 def test_masks_that_say_where_they_belong_are_believed() -> None:
