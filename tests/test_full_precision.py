@@ -130,3 +130,11 @@ def test_gradients_reach_tensors_of_half_precision() -> None:
     product(a, B).sum().backward()
     assert a.grad is not None
     torch.testing.assert_close(a.grad, (torch.ones(2, 2) @ B.T).bfloat16())
+
+
+@pytest.mark.parametrize("device", ["cpu", "xpu", "mps"])
+def test_autocast_is_off_inside_on_every_kind_of_device(device: str) -> None:
+    with torch.autocast(device, dtype=torch.float16):
+        with full_precision():
+            assert not torch.is_autocast_enabled(device)
+        assert torch.is_autocast_enabled(device)

@@ -19,7 +19,7 @@ from directshape_torch.io.frame_layout import FrameFiles
 from directshape_torch.io.image_files import as_pair, read_colours
 from directshape_torch.io.instance_masks import InstanceMask, MaskSizeError
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
-from directshape_torch.io.kitti_labels import KittiObject, poses_cam
+from directshape_torch.io.kitti_labels import KittiObject, own_boxes_2d, poses_cam
 from directshape_torch.io.mask_matching import MIN_OVERLAP, assign
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.io.velodyne import lidar_pose, points_by_columns, read_points
@@ -151,7 +151,7 @@ def _evidence(
         _columns([o.hwl for o in cars], 3),
         np.array([o.rotation_y for o in cars], dtype=np.float64),
         np.array([o.alpha for o in cars], dtype=np.float64),
-        _own_boxes(cars),
+        own_boxes_2d(cars),
     )
     # Where the file has no 2D box nothing but the projected 3D box says where the mask may be.
     T_cam_obj = poses_cam(cars, camera.t_cam_ref[0])
@@ -183,14 +183,6 @@ def _evidence(
         has_masks=masks is not None,
         words=words,
     )
-
-
-def _own_boxes(cars: Sequence[KittiObject]) -> NDArray[np.float64]:
-    """The 2D boxes (N, 4) of the file, zeros for what is none: -1, zeros, or the same numbers for several cars."""
-    boxes = _columns([o.box_2d for o in cars], 4)
-    _, inverse, counts = np.unique(boxes, axis=0, return_inverse=True, return_counts=True)
-    is_none = (boxes <= 0).all(axis=1) | (counts[inverse.reshape(-1)] > 1)
-    return np.where(is_none[:, None], 0.0, boxes)
 
 
 def _telling(

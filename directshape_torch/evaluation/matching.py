@@ -13,11 +13,12 @@ from directshape_torch.files.find_files import found, visible_files
 from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.io import folder_files
 from directshape_torch.io.frame_layout import frames_among, frames_of_split
-from directshape_torch.io.kitti_labels import KittiObject, objects_in, objects_path
+from directshape_torch.io.kitti_labels import KittiObject, objects_in, objects_path, own_boxes_2d
 
 _MINIMUM_IOU_2D = 0.3
-# Within which a detection without a 2D box takes a label, metres along the ground.
-_REACH_M = 4.0
+# Within which a detection without a 2D box takes a label, metres along the ground; and one whose 2D box touches no
+# label's: cars whose middles are less than half a width apart overlap in any image, so that this box is of no use.
+_REACH_M, _CERTAIN_REACH_M = 4.0, 0.8
 # Of labels that count: KITTI's level 1 is partly occluded; the share outside of the image.
 _LEAST_HEIGHT_PX, _MOST_OCCLUDED, _MOST_TRUNCATED = 25.0, 1, 0.5
 
@@ -36,16 +37,19 @@ def is_counted(label: KittiObject, types: Collection[str] = ("Car",)) -> bool:
 def match_to_labels(detections: Sequence[KittiObject], labels: Sequence[KittiObject]) -> dict[int, KittiObject]:
     """The label of each detection that has one, by its place: largest 2D overlap of at least 0.3 first, one to one.
 
-    A detection whose 2D box touches no label's, as LiDAR detectors write -1 or zeros there, takes the nearest label
-    within 4 m instead. Labels of every class with a 3D box compete, so that a detection of a van is not given to the
-    car behind it; which of the matched labels count is another question (`is_counted`). Of equal overlaps the first
-    detection's is taken.
+    A detection without a 2D box takes the nearest label within 4 m instead: LiDAR detectors write one without an area,
+    or the same for all detections. Another one whose 2D box touches no label's takes a label within 0.8 m. Labels of
+    every class with a 3D box compete, so that a detection of a van is not given to the car behind it; which of the
+    matched labels count is another question (`is_counted`). Of equal overlaps the first detection's is taken.
     """
     known = [label for label in labels if label.has_box_3d]
     overlap = box_iou(_image_boxes(detections), _image_boxes(known))
     touches = (overlap > 0).any(axis=1, keepdims=True)
+    reach_m = np.where((own_boxes_2d(detections) == 0).all(axis=1), _REACH_M, _CERTAIN_REACH_M)
     # Above all closenesses, so that 2D overlaps come first.
-    overlap = np.where(touches, np.where(overlap >= _MINIMUM_IOU_2D, 1 + overlap, 0), _closeness(detections, known))
+    overlap = np.where(
+        touches, np.where(overlap >= _MINIMUM_IOU_2D, 1 + overlap, 0), _closeness(detections, known, reach_m)
+    )
     label_of: dict[int, int] = {}
     for place in np.argsort(-overlap, axis=None, kind="stable").tolist():
         row, column = divmod(place, len(known))
@@ -56,11 +60,15 @@ def match_to_labels(detections: Sequence[KittiObject], labels: Sequence[KittiObj
     return {row: known[column] for row, column in sorted(label_of.items())}
 
 
-def _closeness(detections: Sequence[KittiObject], labels: Sequence[KittiObject]) -> NDArray[np.float64]:
+def _closeness(
+    detections: Sequence[KittiObject],
+    labels: Sequence[KittiObject],
+    reach_m: NDArray[np.float64],  # (B,)
+) -> NDArray[np.float64]:
     """One (B, L) at the place of a label, and the least overlap at the end of the reach."""
     places = [np.array([o.location_ref for o in some]).reshape(-1, 3)[:, [0, 2]] for some in (detections, labels)]
     distance = np.linalg.norm(places[0][:, None] - places[1][None], axis=-1)
-    return np.asarray((1 - (1 - _MINIMUM_IOU_2D) * distance / _REACH_M).clip(0))
+    return np.asarray((1 - (1 - _MINIMUM_IOU_2D) * distance / reach_m[:, None]).clip(0))
 
 
 def _image_boxes(objects: Sequence[KittiObject]) -> NDArray[np.float64]:
@@ -107,7 +115,7 @@ def chosen_frames(
         DataFormatError: the file cannot be read.
     """
     if split is not None:
-        known = frames_of_split(split, known, lambda _: False)
+        known = frames_of_split(split, known)
     chosen = list(known) if frames is None else frames_among(known, frames, expected)
     if not chosen:
         raise InputError("frames", f"at least one of the {expected}", "none", "check the choice of frames")

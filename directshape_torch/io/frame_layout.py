@@ -100,6 +100,7 @@ class FrameLayout(Protocol):
 
     detections_dir: Path  # where they are looked for
     detection_file_name: str  # for messages, such as "NNNNNN.txt"
+    sequence: str  # name of the only sequence; "" for several, and where they have no names
 
     def frame_ids(self) -> list[str]:
         """All frames that have detections, sorted."""
@@ -139,9 +140,7 @@ def frames_among(known: Sequence[str], wanted: Iterable[str | int], expected: st
     """
     if isinstance(wanted, (str, int)):
         raise InputError("frames", "a list of ids or numbers", repr(wanted), f"give [{wanted!r}]")
-    of_number = {_number(name.removesuffix("_10")): name for name in reversed(known)}
-    # The ids after the numbers, so that they win.
-    found = of_number | {name: name for name in known}
+    found = _by_name(known)
     words = {word: word if word in found else _number(word) for word in map(str, wanted)}
     if missing := [word for word, key in words.items() if key not in found]:
         example = f", such as {known[0]}" if known else ""
@@ -149,7 +148,9 @@ def frames_among(known: Sequence[str], wanted: Iterable[str | int], expected: st
     return list(dict.fromkeys(found[key] for key in words.values()))
 
 
-def frames_of_split(path: Path | str, known: Sequence[str], exists: Callable[[str], bool]) -> list[str]:
+def frames_of_split(
+    path: Path | str, known: Sequence[str], exists: Callable[[str], bool] = lambda _: False, sequence: str = ""
+) -> list[str]:
     """The frames that the lines of a file name, each once.
 
     A line is an id, a number with leading zeros or without, a path that ends in an id (`image_2/000107.png`), or folder
@@ -159,16 +160,17 @@ def frames_of_split(path: Path | str, known: Sequence[str], exists: Callable[[st
         path: the file.
         known: frames with detections.
         exists: whether there is a frame of a name; one without detections is reported when its turn comes.
+        sequence: whose frames have numbers alone; lines that name a folder must name this one.
 
     Raises:
         DataFormatError: a line names no frame.
     """
-    of_number = {_number(name.removesuffix("_10")): name for name in reversed(known)}
-    found = of_number | {name: name for name in known}
+    found = _by_name(known)
     chosen = []
     for line in read_lines(path):
         folder, *others = (PurePath(word).name for word in line.text.split())
-        words = [line.text, *(f"{folder}_{word}" for word in others[:1]), *others[:1], folder]
+        of_drive = [f"{folder}_{word}" for word in others[:1]] + others[:1] * (folder == sequence)
+        words = [line.text, *of_drive, folder]
         names = [name for word in words for name in (word, _without_ending(word))]
         keys = [key for name in names for key in (name, _number(name)) if key in found]
         unknown = [name for name in names if is_frame_id(name) and exists(name)] if not keys else []
@@ -177,6 +179,12 @@ def frames_of_split(path: Path | str, known: Sequence[str], exists: Callable[[st
             raise line.error(path, "names no frame of the data", f"write one id a line{example}")
         chosen.append(found[keys[0]] if keys else unknown[0])
     return list(dict.fromkeys(chosen))
+
+
+def _by_name(known: Sequence[str]) -> dict[str, str]:
+    """Frames by their ids, which come first, and by their numbers."""
+    of_number = {_number(name.removesuffix("_10")): name for name in reversed(known)}
+    return of_number | {name: name for name in known}
 
 
 def _without_ending(word: str) -> str:

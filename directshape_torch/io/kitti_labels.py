@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.errors import InputError
@@ -69,6 +71,14 @@ def parse_object(path: Path | str, line: Line, is_label: bool = False) -> KittiO
         raw_line=line.raw,
         line_number=line.number,
     )
+
+
+def own_boxes_2d(objects: Sequence[KittiObject]) -> NDArray[np.float64]:  # (N, 4)
+    """The 2D boxes of objects, zeros for what is none: -1, zeros, or the same numbers for several of them."""
+    boxes = np.array([o.box_2d for o in objects], dtype=np.float64).reshape(-1, 4)
+    _, number_of, counts = np.unique(boxes, axis=0, return_inverse=True, return_counts=True)
+    is_none = (boxes <= 0).all(axis=1) | (counts[number_of.reshape(-1)] > 1)
+    return np.where(is_none[:, None], 0.0, boxes)
 
 
 def poses_cam(

@@ -35,6 +35,8 @@ _MOTS_IGNORE_CLASS = 10
 _IDS_PER_CLASS = 1000
 # The instance files of KITTI's semantic benchmark have Cityscapes' classes, of which 24 to 33 have instances.
 _IDS_PER_SEMANTIC_CLASS, _HIGHEST_CLASS, _FIRST_THING = 256, 33, 24
+# Road of the semantic benchmark, 7 * 256, would be instance 792 of class 1.
+_MOST_INSTANCES = 500
 _KNOWN_CLASSES = frozenset({0, 1, 2, _MOTS_IGNORE_CLASS, *range(_FIRST_THING, _HIGHEST_CLASS + 1)})
 _TRACKING_FOLDERS = ("instance_02", "instance_03")
 # With its place in its file.
@@ -126,11 +128,12 @@ class InstancePngMasks:
 
 def _ids_per_class(values: Sequence[int]) -> int:
     """By what classes are multiplied in an image of such numbers: 1000, or 256 where those fit and these do not."""
-    known = all(value // _IDS_PER_CLASS in _KNOWN_CLASSES for value in values)
-    semantic = [divmod(value, _IDS_PER_SEMANTIC_CLASS) for value in values]
+    plain, semantic = ([divmod(value, base) for value in values] for base in (_IDS_PER_CLASS, _IDS_PER_SEMANTIC_CLASS))
+    known = all(category in _KNOWN_CLASSES and number < _MOST_INSTANCES for category, number in plain)
     fits = all(category <= _HIGHEST_CLASS for category, _ in semantic)
     has_things = any(category >= _FIRST_THING and number for category, number in semantic)
-    return _IDS_PER_SEMANTIC_CLASS if not known and fits and has_things else _IDS_PER_CLASS
+    is_stuff = not any(number for _, number in semantic)
+    return _IDS_PER_SEMANTIC_CLASS if not known and fits and (has_things or is_stuff) else _IDS_PER_CLASS
 
 
 @dataclass(frozen=True)

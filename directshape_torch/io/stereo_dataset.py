@@ -370,7 +370,7 @@ def _chosen_frames(
     layout: FrameLayout, split: Path | str | None, frames: Iterable[str | int] | None
 ) -> tuple[str, ...]:
     known = layout.frame_ids()
-    known = known if split is None else frames_of_split(split, known, partial(_has_image, layout))
+    known = known if split is None else frames_of_split(split, known, partial(_has_image, layout), layout.sequence)
     where = f"{layout.detections_dir}" if split is None else f"{split}"
     if not known:
         files = f"detection file {layout.detection_file_name} in" if split is None else "frame in"

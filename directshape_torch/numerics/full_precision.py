@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import wraps
+from functools import partial, wraps
 from typing import Any, NamedTuple, ParamSpec, TypeGuard, TypeVar
 
 import torch
@@ -98,9 +98,12 @@ class _Thread(threading.local):
 _thread = _Thread()
 
 
+_off = partial(torch.autocast, enabled=False)
+
+
 @contextmanager
 def _no_autocast() -> Iterator[None]:
-    with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
+    with _off("cpu"), _off("cuda"), _off("xpu"), _off("mps"):
         yield
 
 

@@ -30,6 +30,15 @@ def test_a_detection_without_a_2d_box_takes_the_nearest_label(box):
     assert match_to_labels([near, nearer, far], labels) == {1: labels[1]}
     with_box = _object((300, 100, 400, 200), x=20.0)
     assert match_to_labels([nearer, with_box], labels) == {1: labels[1]}
+    # Half a metre away it is the same car whatever its box says.
+    assert match_to_labels([_object(box, x=8.5)], labels) == {0: labels[1]}
+
+
+def test_a_detection_with_a_2d_box_of_its_own_takes_no_label_that_this_misses():
+    """A false positive beside a car that nobody detected."""
+    label = _object((100, 100, 200, 200), x=0.0)
+    assert match_to_labels([_object((250 + x, 100, 360, 200), x=x) for x in (1.0, 3.9)], [label]) == {}
+    assert match_to_labels([], [label]) == match_to_labels([label], []) == {}
 
 
 def test_each_detection_takes_its_largest_free_overlap():

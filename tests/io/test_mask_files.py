@@ -198,6 +198,18 @@ def test_instance_png_of_kittis_semantic_benchmark(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found[26 * 256 + 3].whole(SIZE_HW), MASK)
 
 
+@pytest.mark.parametrize(
+    ("numbers", "cars"), [((7 * 256, 8 * 256, 11 * 256), 0), ((7 * 256, 0), 0), ((0, 1024), 1), ((1256, 2048), 1)]
+)
+def test_a_street_without_instances_shows_no_car(tmp_path: Path, numbers: tuple[int, ...], cars: int) -> None:
+    """Roads, 7 * 256, are no cars of class 1; cars whose numbers happen to be multiples of 256 are."""
+    ids = np.full(SIZE_HW, numbers[0], np.uint16)
+    for row, number in enumerate(numbers):
+        ids[row] = number
+    write_png(tmp_path / "instance_2" / "000000.png", ids)
+    assert sum(mask.is_car for mask in mask_source(tmp_path).read("000000", SIZE_HW)) == cars
+
+
 def test_instance_png_of_8_bits_is_refused_and_an_empty_one_is_not(tmp_path: Path) -> None:
     write_png(tmp_path / "instance_2" / "000000.png", np.where(MASK, 3, 0).astype(np.uint8))
     with pytest.raises(DataFormatError, match=r"has 8 bits and numbers up to 3, where class \* 1000 .*; write 16 bits"):

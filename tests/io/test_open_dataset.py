@@ -193,6 +193,19 @@ def test_a_split_of_raw_drives_and_lines_that_name_nothing(kitti: Path, tmp_path
         open_dataset("raw", tmp_path / DAY, detections, masks, split=split)
 
 
+def test_a_split_of_drives_where_one_is_open(kitti: Path, tmp_path: Path) -> None:
+    """Frames of other drives have the same numbers, and words are no drive."""
+    drive = write_raw(kitti, tmp_path, FRAMES)
+    detections, masks = renamed(kitti, tmp_path, ("data/0000000000", "data/0000000001"))
+    split = tmp_path / "split.txt"
+    write(split, f"{DAY}/{DRIVE} 0000000001 l\n")
+    assert open_dataset("raw", drive, detections, masks, split=split).frame_ids == ("0000000001",)
+    for line in (f"{DAY}/2011_09_26_drive_0009_sync 0000000001 l", "frame 1 was bad"):
+        write(split, f"0000000000\n{line}\n")
+        with pytest.raises(DataFormatError, match=r"split.txt, line 2: names no frame of the data"):
+            open_dataset("raw", drive, detections, masks, split=split)
+
+
 @pytest.mark.parametrize("name", ["0005.txt", "instances.txt"])
 def test_text_masks_of_kitti_mots(kitti: Path, tmp_path: Path, name: str) -> None:
     """The left masks of every form are the same, and their numbers are tracks."""
