@@ -321,7 +321,7 @@ class Detections(TensorRecord):
             frame_index=as_index(like.new_zeros(count, dtype=torch.long) if frame_index is None else frame_index, like),
             T_cam_obj=T_cam_obj,
             dimensions_hwl=dimensions_hwl,
-            box_2d=as_floating(left.box_2d if box_2d is None else box_2d, like),
+            box_2d=left.box_2d.to(like) if box_2d is None else as_floating(box_2d, like),
             score=as_floating(like.new_ones(count) if score is None else score, like),
             mask_left=left,
             mask_right=right,

@@ -172,6 +172,7 @@ def test_wrong_inputs_are_named() -> None:
         module(scene.frames.to(dtype=torch.float32), scene.detections)
     with pytest.raises(InputError, match=r"detections.frame_index: expected 0..0, got 0..3"):
         module(scene.frames, replace(scene.detections, frame_index=torch.tensor([0, 3])))
-    small = {name: getattr(scene.detections, name).dense()[:, :50] for name in ("mask_left", "mask_right")}
-    with pytest.raises(InputError, match="masks of the \\(padded\\) image size"):
-        module(scene.frames, replace(scene.detections, **small))
+    for name in ("mask_left", "mask_right"):
+        small = {name: getattr(scene.detections, name).dense()[:, :50]}
+        with pytest.raises(InputError, match=rf"detections\.{name}: expected masks of the \(padded\) image size"):
+            module(scene.frames, replace(scene.detections, **small))

@@ -19,7 +19,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.ground_plane import GroundPlane
 from directshape_torch.geometry.projection import project
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.scene import Occluders
+from directshape_torch.scene import Detections, Occluders
 from directshape_torch.status import Status
 
 
@@ -296,6 +296,28 @@ def test_moving_to_a_dtype_keeps_integers_and_masks() -> None:
     assert frames.sizes.dtype == detections.frame_index.dtype == torch.int64
     assert detections.has_mask_left.dtype == torch.bool
     assert frames.frame_ids == scene.frames.frame_ids
+
+
+def test_masks_keep_their_dtype_where_numbers_follow_the_frames() -> None:
+    detections = cached_street()[1].detections
+    soft = replace(detections, mask_left=0.9 * detections.mask_left.dense().half())
+    for dtype in (torch.float32, torch.float64):
+        moved = soft.in_dtype(dtype)
+        assert (moved.T_cam_obj.dtype, moved.mask_left.values.dtype) == (dtype, torch.float16)
+        assert moved.mask_left.dense().equal(soft.mask_left.dense())
+
+
+def test_cars_with_masks_and_then_of_higher_scores_tell_most() -> None:
+    count = 300
+    score = torch.linspace(0, 1, count)
+    masks = torch.zeros(count, 4, 6)
+    masks[:50:2] = 1.0
+    boxes = torch.tensor([[0.0, 1.6, 20.0, 1.5, 1.6, 4.0, 0.0]]).repeat(count, 1)
+    frame_index = torch.arange(count) // 150
+    detections = Detections.from_boxes(boxes, mask_left=masks, score=score, frame_index=frame_index)
+    assert detections.telling_rows(0) == [*range(0, 50, 2), *range(75, 150)]
+    assert detections.telling_rows(1) == list(range(200, 300))
+    assert detections.rows(torch.arange(20)).telling_rows(0) == list(range(20))
 
 
 def test_whoever_hides_cars_hides_whichever_are_chosen() -> None:

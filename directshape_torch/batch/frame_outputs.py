@@ -168,8 +168,10 @@ def _shape_arrays(loaded: LoadedFrame, result: RefinementResult, boxes: KittiBox
 def _messages(loaded: LoadedFrame, result: RefinementResult) -> tuple[str, ...]:
     """What each car's status says; where its mask was looked for among those of a frame, why it has none."""
     reasons = loaded.no_mask_reasons or ("",) * len(result)
-    is_missing = [status is Status.no_mask and reason for status, reason in zip(result.status, reasons, strict=True)]
-    return tuple(reason or status.value for status, reason in zip(result.status, is_missing, strict=True))
+    return tuple(
+        reason if reason and status is Status.no_mask else status.value
+        for status, reason in zip(result.status, reasons, strict=True)
+    )
 
 
 def _tracks(loaded: LoadedFrame) -> tuple[str, ...]:

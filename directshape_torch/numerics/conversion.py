@@ -21,7 +21,7 @@ _WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.
 
 
 def working_dtype(dtype: torch.dtype) -> torch.dtype:
-    """The dtype in which numbers of one are computed with: float64 and float32 themselves, float32 for all others.
+    """The dtype that computations on numbers of a dtype use: float64 for float64, float32 for all others.
 
     Half precision has three digits: it may carry a box from a network, but no product of transforms.
     """

@@ -20,6 +20,7 @@ from torch import Tensor
 from directshape_torch.files.atomic_files import write_text
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import rotation_y_from_pose, viewing_axes, wrap_angle
+from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.numerics.records import CarRecord, Dense
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.refinement.disparity_profile import DisparityProfile
@@ -198,7 +199,7 @@ def mask_ious(masks: MaskRows, seen: Sight) -> Tensor:
     """Overlap (2, B) of shape and mask over the pixels of the left and the right image."""
     distance = seen.field.value(seen.closest.points_obj, masks.rays.owner)
     counts = masks.filled.to(torch.float64)
-    covered, masked = seen.closest.crosses & (distance < 0), masks.foreground > 0.5
+    covered, masked = seen.closest.crosses & (distance < 0), masks.foreground > MASK_THRESHOLD
     both, either = ((x * counts).sum(dim=1) for x in (covered & masked, covered | masked))
     num_cars = len(masks.blocks.counts)
     sums = CarSums.of(masks.rays.owner + num_cars * masks.side, 2 * num_cars)

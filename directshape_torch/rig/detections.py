@@ -8,6 +8,7 @@ from torch import Tensor
 from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.geometry.projection import project, rays_from_pixels
 from directshape_torch.geometry.se3 import inverse, transform
+from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.rig.rig import Rig
 from directshape_torch.rows import ObjectRays
 from directshape_torch.scene import Detections, FrameBatch
@@ -138,7 +139,7 @@ def _pixels_of_car(detections: Detections, car: int, T_cam_obj: Tensor, hwl: Ten
     """(H, W) the car's mask; without a mask the pixels round its box."""
     width, height = rig.size_wh
     if bool(detections.has_mask_left[car]):
-        return detections.mask_left[car][:height, :width].detach().cpu() > 0.5
+        return detections.mask_left[car][:height, :width].detach().cpu() > MASK_THRESHOLD
     corners = project(box_corners(T_cam_obj, hwl), rig.K_left)
     limit = torch.tensor([width, height]).double()
     low, high = corners.amin(dim=0).maximum(0 * limit).long(), corners.amax(dim=0).minimum(limit).ceil().long()

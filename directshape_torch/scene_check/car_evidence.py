@@ -14,6 +14,7 @@ from torch import Tensor
 from directshape_torch.geometry.box3d import rotation_y_from_pose
 from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.scene import SIDES, Detections, FrameBatch, Side
 from directshape_torch.scene_check.words import Words, words_of_tensors
 from directshape_torch.stereo_matching.disparity import rgb8
@@ -137,7 +138,7 @@ def _frame_evidence(
     )
     left = list(zip(around["left"], has["left"], strict=True))
     whole = tuple(
-        (masks["left"][row] > 0.5).cpu().numpy()[: size_hw[0], : size_hw[1]] if known else None
+        (masks["left"][row] > MASK_THRESHOLD).cpu().numpy()[: size_hw[0], : size_hw[1]] if known else None
         for row, known in enumerate(has["left"])
     )
     return FrameEvidence(

@@ -60,22 +60,20 @@ def car_points(frames: FrameBatch, detections: Detections, config: PointCloudCon
 def _pixels(frames: FrameBatch, d: Detections) -> tuple[Tensor, Tensor, Tensor]:
     """The left pixels of each car, of its mask where it has one, else of its 2D box: car, row and column (P,) each."""
     parts = []
-    boxes, sizes = d.box_2d.detach().double().cpu(), frames.sizes[d.frame_index].tolist()
-    corners = torch.cat([boxes[:, :2].ceil(), boxes[:, 2:].floor() + 1], dim=1).nan_to_num(0.0)
-    has_mask, crops = d.has_mask_left.tolist(), d.mask_left.boxes.tolist()
+    has_mask, crops, sizes = d.has_mask_left.tolist(), d.mask_left.boxes.tolist(), frames.sizes[d.frame_index].tolist()
+    boxes = d.box_2d.detach().double().cpu()
+    corners = torch.cat([boxes[:, :2].ceil(), boxes[:, 2:].floor() + 1], dim=1).clamp(min=0)
+    corners[boxes.isnan().any(dim=1)] = 0
     for car, (height, width) in enumerate(sizes):
         # Whatever the padding of a smaller frame holds is no part of it.
-        limit = torch.tensor([width, height, width, height], dtype=torch.float64)
-        u0, v0, u1, v1 = corners[car].clamp(min=0).minimum(limit).long().tolist()
         if has_mask[car]:
             u0, v0 = crops[car][:2]
-            v, u = (
-                (d.mask_left.crop(car) > MASK_THRESHOLD)[: max(0, height - v0), : max(0, width - u0)]
-                .nonzero()
-                .unbind(1)
-            )
+            pixels = d.mask_left.crop(car)[: max(0, height - v0), : max(0, width - u0)] > MASK_THRESHOLD
         else:
-            v, u = d.frame_index.new_ones(max(0, v1 - v0), max(0, u1 - u0)).nonzero().unbind(1)
+            limit = boxes.new_tensor([width, height, width, height])
+            u0, v0, u1, v1 = corners[car].minimum(limit).long().tolist()
+            pixels = d.frame_index.new_ones(max(0, v1 - v0), max(0, u1 - u0))
+        v, u = pixels.nonzero().unbind(1)
         parts.append(torch.stack([torch.full_like(v, car), v + v0, u + u0]))
     return tuple(torch.cat(parts, dim=1)) if parts else (d.frame_index[:0],) * 3
 

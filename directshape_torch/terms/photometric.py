@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import PhotometricConfig, StageConfig
+from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.numerics.tensors import length
 from directshape_torch.rows import BLOCK, Blocks, CarSums, ObjectRays, Rays, Rows
@@ -115,7 +116,7 @@ class Photometric(Term):
         on_surface = (hits.found & ~is_grazing(hits.normal_obj, rays.direction_obj)).flatten()
         candidates = on_surface.index_select(0, left.packed.places)
         if self.config.pixel_set == "hit_and_mask":
-            candidates = candidates & (left.pixels.foreground > 0.5)
+            candidates = candidates & (left.pixels.foreground > MASK_THRESHOLD)
         chosen = candidates.nonzero()[:, 0]
         packed = Rows.of_sorted(left.pixels.object_index[chosen], len(self.cars))
         row = chosen[packed.row]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from directshape_torch.config import SamplingMode
 from directshape_torch.errors import InputError
 from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.observation.packing import pack_pixels, residual_offsets
 from directshape_torch.scene import SIDES, Side
 from directshape_torch.visualize.drawing import (
@@ -133,7 +134,7 @@ class CarCourse:
             mask = masks[self.row].float().cpu().numpy()
             size_wh = view.picture.shape[1::-1]
             found = cv2.warpAffine(mask, view.from_image[:2], size_wh, flags=cv2.INTER_LINEAR)
-            draw_outline(view.picture, (found > 0.5).astype(np.uint8), WHITE, 1)
+            draw_outline(view.picture, (found > MASK_THRESHOLD).astype(np.uint8), WHITE, 1)
 
     def from_above(self, count: int) -> Picture:
         """The first `count` boxes and the true one; all boxes would fit, so that pictures can follow one another."""

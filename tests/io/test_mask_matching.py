@@ -195,16 +195,15 @@ def test_the_right_mask_of_a_hidden_car_is_found_by_way_of_the_left_one() -> Non
 
 
 def test_the_disparity_of_a_car_at_the_edge_of_the_image_is_that_of_the_whole_car() -> None:
-    """The right image shows more of it; the mask of something behind lies where half of the disparity leads."""
-    left = seen(6.3, 9.0)
-    (u0, v0, u1, v1), shift = map(int, left.mask_box), -round(500 * 0.5 / 9)
-    assert u1 == SIZE_HW[1] - 1
-    own, other = (
-        square((first, v0, last, v1), "right", number)
-        for number, first, last in ((1, u0 + shift, u1 + shift), (2, u1 + shift + 1, u1 + shift // 2))
-    )
-    for masks in ([left, own, other], [left, other, own]):
-        assert numbers(matched([car(1, 6.3, 9.0)], masks).right) == [1]
+    """Beside its right mask, where half of the disparity leads or none at all, lies that of something behind it."""
+    for x, u_side, share in ((6.3, SIZE_HW[1] - 1, 0.5), (-6.3, 0, 0.0)):
+        left = seen(x, 9.0)
+        (u0, v0, u1, v1), shift = map(int, left.mask_box), -round(500 * 0.5 / 9)
+        assert u_side in (u0, u1)
+        own = square((u0 + shift, v0, u1 + shift, v1), "right", 1)
+        other = square((u1 + shift + 1, v0, round(u1 + share * shift), v1), "right", 2)
+        for masks in ([left, own, other], [left, other, own]):
+            assert numbers(matched([car(1, x, 9.0)], masks).right) == [1]
 
 
 @pytest.mark.parametrize(("x", "z", "right_cx"), [(42.0, 70.0, 330.0), (-42.0, 70.0, 270.0), (-4.5, 6.0, 300.0)])

@@ -94,6 +94,19 @@ def test_a_box_beyond_all_numbers_has_no_size_in_the_image(row: int) -> None:
     assert size_error(T_cam_obj, dimensions_hwl, mask, K) == 0
 
 
+def test_padding_of_a_batch_changes_no_observation(demo: LoadedFrame) -> None:
+    height, width = demo.frame.images_left.shape[-2:]
+    pad = {
+        name: torch.nn.functional.pad(getattr(demo.frame, name), (0, 31, 0, 17))
+        for name in ("images_left", "images_right")
+    }
+    masks = {
+        name: getattr(demo.detections, name).padded((height + 17, width + 31)) for name in ("mask_left", "mask_right")
+    }
+    padded = observe_detections(replace(demo.frame, **pad), replace(demo.detections, **masks))
+    assert padded.equal(observe_detections(demo.frame, demo.detections))
+
+
 def test_without_masks_the_boxes_themselves_are_looked_at(demo: LoadedFrame) -> None:
     with_masks = observe_detections(demo.frame, demo.detections)
     blind = masked(demo.detections, torch.zeros(len(demo.detections), dtype=torch.bool))

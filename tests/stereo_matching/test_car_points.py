@@ -103,6 +103,39 @@ def test_the_padding_of_a_smaller_frame_holds_no_points() -> None:
     assert car_points(frames, everywhere, ALL).counts.tolist() == [80 * 70] * 2
 
 
+def test_masks_beyond_a_smaller_frame_hold_no_points() -> None:
+    scene = measured_street()[1]
+    whole = scene.detections.mask_left.dense() > 0.5
+    u0, v0, u1, v1 = scene.detections.mask_left.extents[0].tolist()
+    width, height = (u0 + u1) // 2, (v0 + v1) // 2
+    frames = replace(scene.frames, sizes=torch.tensor([[height, width]]))
+    counts = car_points(frames, scene.detections, ALL).counts
+    assert counts.tolist() == whole[:, :height, :width].sum(dim=(1, 2)).tolist()
+    assert 0 < counts[0] < whole[0].sum()
+
+
+@pytest.mark.parametrize(
+    ("box_2d", "count"),
+    [
+        ((10.2, 5.5, 14.9, 8.0), 4 * 3),
+        ((10.0, 5.0, 14.0, 5.0), 5),
+        ((-3.0, -3.0, 0.5, 0.5), 1),
+        ((float("nan"), 5.0, 14.0, 8.0), 0),
+    ],
+)
+def test_pixels_whose_middle_is_in_the_box_are_those_of_a_car_without_a_mask(
+    box_2d: tuple[float, float, float, float], count: int
+) -> None:
+    scene = measured_street()[1]
+    assert scene.frames.disparity is not None
+    points = points_of(
+        present=NO_MASK,
+        disparity=torch.full_like(scene.frames.disparity, 7.0),
+        box_2d=torch.tensor(box_2d).double().expand(2, 4),
+    )
+    assert points.counts.tolist() == [count] * 2
+
+
 def test_of_too_many_every_nth_is_kept() -> None:
     everything, some = points_of(), points_of(replace(ALL, max_points=100))
     assert torch.equal(some.counts, everything.counts)
