@@ -164,14 +164,17 @@ def _summarised(name: str, cars: Sequence[ComparedCar], num_draws: int, seed: in
 
 
 def _frames_of(before: Path, after: Path) -> tuple[str, ...]:
-    """Of the files of `before`; of a sequence, and of a single file, those that `after` has."""
+    """Of the files of `before`; of the file or folder of a sequence, and of a single file, those that `after` has."""
     results = files_of_frames(after)
     if before.is_file():
         return tuple(results)
     of_sequence: dict[str, list[str]] = {}
     for stem in results:
         of_sequence.setdefault(stem.rpartition("_")[0], []).append(stem)
-    return tuple(frame for stem in files_of_frames(before) for frame in of_sequence.get(stem, [stem]))
+    if stems := files_of_frames(before):
+        return tuple(frame for stem in stems for frame in of_sequence.get(stem, [stem]))
+    folders = [sequence for sequence in of_sequence if sequence and (before / sequence).is_dir()]
+    return tuple(frame for sequence in folders for frame in of_sequence[sequence])
 
 
 def _cars_of_frame(sources: tuple[Path, Path, Path], frame_id: str) -> tuple[list[ComparedCar], int]:

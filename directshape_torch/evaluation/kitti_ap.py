@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -157,7 +158,8 @@ def _percent(samples: Floats) -> float:
 def _files(folder: Path | str, name: str) -> dict[str, Path]:
     if not Path(folder).is_dir():
         raise DataFormatError(folder, f"is no folder of {name}", cure="give the folder that holds the files NNNNNN.txt")
-    return files_of_frames(Path(folder))
+    # However each of the two folders writes accents.
+    return {unicodedata.normalize("NFC", name): path for name, path in files_of_frames(Path(folder)).items()}
 
 
 def _results(path: Path) -> list[KittiObject]:

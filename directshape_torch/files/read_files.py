@@ -31,7 +31,11 @@ _MOST_TEXT_BYTES = 2**24
 # Parsed JSON takes some twenty times its size.
 _MOST_JSON_BYTES = 2**28
 _MOST_DIGITS = 18
-_UTF16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+# Those of UTF-32 come first, for they begin as those of UTF-16 do.
+_MARKS = {
+    **dict.fromkeys((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE), "utf-32"),
+    **dict.fromkeys((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE), "utf-16"),
+}
 # Lines end as on Unix, on Windows (whose other half stays, so that lines are copied as they are) or on old Macs.
 _LINE_END = re.compile(r"\n|\r(?!\n)")
 # What is left of the 255 that file systems take belongs to endings and to the names of temporary files.
@@ -93,12 +97,13 @@ def _open_at_once(path: str, flags: int) -> int:
 
 
 def read_text(path: Path | str, most: int = _MOST_TEXT_BYTES, cure: str = "check the path") -> str:
-    """The content of a text file in UTF-8, or in UTF-16 where it begins with a mark of that; the mark is left out.
+    """The content of a text file in UTF-8, or in UTF-16 or UTF-32 where it begins with the mark of that.
 
-    PowerShell and Excel begin texts with such a mark. Raises like `read_bytes`, and where it is no such text.
+    PowerShell and Excel begin texts with such a mark, which is left out. Raises like `read_bytes`, and where it is no
+    such text.
     """
     content = read_bytes(path, most, cure)
-    encoding = "utf-16" if content.startswith(_UTF16_MARKS) else "utf-8-sig"
+    encoding = next((encoding for mark, encoding in _MARKS.items() if content.startswith(mark)), "utf-8-sig")
     try:
         return content.decode(encoding)
     except UnicodeDecodeError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
@@ -141,7 +142,7 @@ def frames_among(known: Sequence[str], wanted: Iterable[str | int], expected: st
     if isinstance(wanted, (str, int)):
         raise InputError("frames", "a list of ids or numbers", repr(wanted), f"give [{wanted!r}]")
     found = _by_name(known)
-    words = {word: word if word in found else _number(word) for word in map(str, wanted)}
+    words = {word: word if word in found else _key(word) for word in map(str, wanted)}
     if missing := [word for word, key in words.items() if key not in found]:
         example = f", such as {known[0]}" if known else ""
         raise InputError("frames", f"{expected}{example}", ", ".join(missing[:5]), "check the choice of frames")
@@ -172,7 +173,7 @@ def frames_of_split(
         of_drive = [f"{folder}_{word}" for word in others[:1]] + others[:1] * (folder == sequence)
         words = [line.text, *of_drive, folder]
         names = [name for word in words for name in (word, _without_ending(word))]
-        keys = [key for name in names for key in (name, _number(name)) if key in found]
+        keys = [key for name in names for key in (name, _key(name)) if key in found]
         unknown = [name for name in names if is_frame_id(name) and exists(name)] if not keys else []
         if not keys and not unknown:
             example = f", such as {known[0]}" if known else ""
@@ -183,7 +184,7 @@ def frames_of_split(
 
 def _by_name(known: Sequence[str]) -> dict[str, str]:
     """Frames by their ids, which come first, and by their numbers."""
-    of_number = {_number(name.removesuffix("_10")): name for name in reversed(known)}
+    of_number = {_key(name.removesuffix("_10")): name for name in reversed(known)}
     return of_number | {name: name for name in known}
 
 
@@ -193,9 +194,9 @@ def _without_ending(word: str) -> str:
     return name.stem if name.suffix.lower() in (*IMAGE_ENDINGS, ".bin", ".txt", ".json") else word
 
 
-def _number(word: str) -> str:
-    """A number without leading zeros; other names as they are."""
-    return word.lstrip("0") or "0" if word.isdecimal() else word
+def _key(word: str) -> str:
+    """A number without leading zeros; of other names the spelling in which letters and accents are one."""
+    return word.lstrip("0") or "0" if word.isdecimal() else unicodedata.normalize("NFC", word)
 
 
 def existing_folder(path: Path, problem: str, cure: str = "check the path") -> Path:

@@ -135,16 +135,21 @@ def read_tracking_objects(path: Path | str) -> dict[int, list[KittiObject]]:
 def objects_path(source: Path, frame_id: str) -> Path:
     """The file of a frame `FRAME` or `SEQUENCE_NNNNNN`.
 
-    `source` is a folder of `FRAME.txt` or `SEQUENCE.txt`, or one with `data` of them, or the file of a sequence.
+    `source` is a folder of `FRAME.txt`, `SEQUENCE.txt` or `SEQUENCE/NNNNNN.txt`, or one with `data` of these, or the
+    file of a sequence.
     """
-    of_frame, sequence = file_of_frame(source, f"{frame_id}.txt"), frame_id.rpartition("_")[0]
-    of_sequence = source if source.is_file() else file_of_frame(source, f"{sequence}.txt")
-    return of_sequence if not of_frame.is_file() and of_sequence.is_file() else of_frame
+    sequence, _, number = frame_id.rpartition("_")
+    of_frame, of_sequence = file_of_frame(source, f"{frame_id}.txt"), file_of_frame(source, f"{sequence}.txt")
+    others = (
+        [source, of_sequence, file_of_frame(source / sequence, f"{number}.txt")] if sequence or source.is_file() else []
+    )
+    return next((path for path in (of_frame, *others) if path.is_file()), of_frame)
 
 
 def objects_in(path: Path, *names: str) -> list[KittiObject]:
-    """The objects of a frame in a file that is called as the frame, else in one of the tracking benchmark."""
-    if is_called(path, names):
+    """The objects of a frame in a file called as the frame or its number, else in one of the tracking benchmark."""
+    sequence, _, number = names[0].rpartition("_")
+    if is_called(path, names) or (is_called(path, [number]) and number != sequence):
         return read_objects(path)
     # A list of the caller's own, for that of the file is remembered.
     return [*read_tracking_objects(path).get(frame_number(names[0]), [])]

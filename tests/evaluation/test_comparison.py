@@ -172,6 +172,11 @@ def test_files_of_the_tracking_benchmark(folders: tuple[Path, Path, Path], tmp_p
     several = compare_results(*sequences, folders[2])
     assert [(car.before, car.after) for car in several.cars] == expected
     assert [car.frame_id for car in several.cars] == ["0005_000001", "0005_000001", "0005_000002"]
+    # A folder for each sequence, as the refinement takes detections too.
+    apart = tmp_path / "apart" / "0005"
+    apart.parent.mkdir()
+    (folders[1] / "data").rename(apart)
+    assert compare_results(sequences[0], apart.parent, folders[2]).cars == several.cars
     with pytest.raises(InputError, match="such as 0005_000001, got 0005_first"):
         compare_results(*sequences, folders[2], frames=["0005_first"])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import unicodedata
 from pathlib import Path
 
 import numpy as np
@@ -114,6 +115,17 @@ class TestFilesAndErrors:
         scores = evaluate_kitti(str(folders[0]), str(folders[1] / "data"), split=str(tmp_path / "val.txt"))
         assert (scores.num_frames, scores.num_result_frames_unused) == (1, 1)
         assert scores.score("3d", 0.7, "easy").ap_area == 100
+
+    def test_accents_may_be_written_differently_in_each_folder(self, tmp_path: Path) -> None:
+        names = [
+            tmp_path / folder / unicodedata.normalize(form, "é1.txt") for folder, form in (("a", "NFC"), ("b", "NFD"))
+        ]
+        for path, text in zip(names, (line(), line(score=1)), strict=True):
+            path.parent.mkdir()
+            path.write_text(text + "\n")
+        assert evaluate_kitti(tmp_path / "a", tmp_path / "b").score("3d", 0.7, "easy").ap_area == 100
+        for name in (path.stem for path in names):
+            assert evaluate_kitti(tmp_path / "b", tmp_path / "b", frames=[name]).num_frames == 1
 
     def test_a_result_without_score(self, folders: tuple[Path, Path]) -> None:
         path = folders[1] / "data" / "000002.txt"

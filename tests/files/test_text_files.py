@@ -9,12 +9,12 @@ import pytest
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.read_files import read_json, read_lines, read_text
 
-MARKED = ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"]
+MARKED = ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-32-be"]
 
 
 def encoded(text: str, encoding: str) -> bytes:
     """The text with the mark that programs put before it."""
-    mark = "\ufeff" if encoding in ("utf-16-le", "utf-16-be") else ""
+    mark = "\ufeff" if encoding in ("utf-16-le", "utf-16-be", "utf-32-be") else ""
     return (mark + text).encode(encoding)
 
 
