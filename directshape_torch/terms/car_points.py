@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor
 
@@ -13,6 +15,8 @@ from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.rows import PointSamples
 from directshape_torch.scene import Detections, FrameBatch
 
+# Of a part of the cars: some 200 bytes each.
+_MOST_PIXELS = 2**20
 # Above the ground plane: lower points are road, higher ones trees.
 _HEIGHTS_M = (0.1, 3.0)
 # Of the detection's centre, along the ground: a long car's half and what a detector is wrong by.
@@ -36,7 +40,18 @@ def car_points(frames: FrameBatch, detections: Detections, config: PointCloudCon
     disparity = frames.disparity
     if disparity is None:
         raise InputError("frames.disparity", "a disparity map of each frame", "None", "use with_disparity")
-    object_index, v, u = _pixels(frames, detections)
+    parts = [_points(frames, detections, disparity, pixels) for pixels in _pixels(frames, detections)]
+    object_index, points_cam = (torch.cat(columns) for columns in zip(*parts, strict=True))
+    counts = occurrences(object_index, len(detections))
+    kept = every_nth(object_index, counts, config.max_points)
+    return PointSamples(object_index[kept], points_cam[kept], counts)
+
+
+def _points(
+    frames: FrameBatch, detections: Detections, disparity: Tensor, pixels: Tensor
+) -> tuple[Tensor, Tensor]:  # (P,), (P, 3)
+    """The points at pixels, those that may be their car's: its number and where they are."""
+    object_index, v, u = pixels  # (3, P)
     known = _known(disparity[detections.frame_index[object_index], v, u]).nonzero()[:, 0]
     object_index, v, u = object_index[known], v[known], u[known]
     frame = detections.frame_index[object_index]
@@ -51,19 +66,19 @@ def car_points(frames: FrameBatch, detections: Detections, config: PointCloudCon
     )
     passes = stands_at(frames, detections, object_index, points_cam.detach(), _REACH_M, _HEIGHTS_M)
     passed = passes.nonzero()[:, 0]
-    object_index, points_cam = object_index[passed], points_cam[passed]
-    counts = occurrences(object_index, len(detections))
-    kept = every_nth(object_index, counts, config.max_points)
-    return PointSamples(object_index[kept], points_cam[kept], counts)
+    return object_index[passed], points_cam[passed]
 
 
-def _pixels(frames: FrameBatch, d: Detections) -> tuple[Tensor, Tensor, Tensor]:
-    """The left pixels of each car, of its mask where it has one, else of its 2D box: car, row and column (P,) each."""
-    parts = []
+def _pixels(frames: FrameBatch, d: Detections) -> Iterator[Tensor]:
+    """The left pixels of each car, of its mask where it has one, else of its 2D box: car, row and column (3, P).
+
+    They come in parts that bound the memory, for thousands of boxes without a mask cover an image many times over.
+    """
     has_mask, crops, sizes = d.has_mask_left.tolist(), d.mask_left.boxes.tolist(), frames.sizes[d.frame_index].tolist()
     boxes = d.box_2d.detach().double().cpu()
     corners = torch.cat([boxes[:, :2].ceil(), boxes[:, 2:].floor() + 1], dim=1).clamp(min=0)
     corners[boxes.isnan().any(dim=1)] = 0
+    part = [d.frame_index.new_zeros(3, 0)]
     for car, (height, width) in enumerate(sizes):
         # Whatever the padding of a smaller frame holds is no part of it.
         if has_mask[car]:
@@ -74,8 +89,11 @@ def _pixels(frames: FrameBatch, d: Detections) -> tuple[Tensor, Tensor, Tensor]:
             u0, v0, u1, v1 = corners[car].minimum(limit).long().tolist()
             pixels = d.frame_index.new_ones(max(0, v1 - v0), max(0, u1 - u0))
         v, u = pixels.nonzero().unbind(1)
-        parts.append(torch.stack([torch.full_like(v, car), v + v0, u + u0]))
-    return tuple(torch.cat(parts, dim=1)) if parts else (d.frame_index[:0],) * 3
+        part.append(torch.stack([torch.full_like(v, car), v + v0, u + u0]))
+        if sum(each.shape[1] for each in part) > _MOST_PIXELS:
+            yield torch.cat(part, dim=1)
+            part = part[:1]
+    yield torch.cat(part, dim=1)
 
 
 def _known(disparity: Tensor) -> Tensor:

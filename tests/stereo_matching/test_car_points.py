@@ -136,6 +136,15 @@ def test_pixels_whose_middle_is_in_the_box_are_those_of_a_car_without_a_mask(
     assert points.counts.tolist() == [count] * 2
 
 
+def test_in_parts_the_points_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Many boxes without masks are read in parts, for memory."""
+    whole = points_of(present=NO_MASK), points_of()
+    monkeypatch.setattr(points_of_cars, "_MOST_PIXELS", 10)
+    for expected, found in zip(whole, (points_of(present=NO_MASK), points_of()), strict=True):
+        assert found.points_cam.equal(expected.points_cam)
+        assert found.counts.equal(expected.counts)
+
+
 def test_of_too_many_every_nth_is_kept() -> None:
     everything, some = points_of(), points_of(replace(ALL, max_points=100))
     assert torch.equal(some.counts, everything.counts)
