@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.errors import InputError, shown
+from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import check_shape
 from directshape_torch.numerics.conversion import Given, as_tensor
 from directshape_torch.numerics.records import Dense, TensorRecord
@@ -77,14 +77,19 @@ class MaskCrops(TensorRecord):
         """
         if isinstance(masks, cls):
             return masks if present is None else masks.where(_flags(name, present, len(masks)))
-        masks = _foreground_of(name, masks)
-        present = torch.ones(len(masks), dtype=torch.bool) if present is None else _flags(name, present, len(masks))
-        entries = [mask if here else None for mask, here in zip(masks, present.tolist(), strict=True)]
-        known = iter(_supports([mask for mask in entries if mask is not None]))
+        masks = masks if isinstance(masks, (list, tuple)) else as_tensor(masks)
+        entries = _entries(name, masks)
+        first = next(mask for mask in (*entries, masks) if isinstance(mask, Tensor))
+        if present is not None:
+            here = _flags(name, present, len(entries)).tolist()
+            entries = [mask if flag else None for mask, flag in zip(entries, here, strict=True)]
+        used = _foreground([mask for mask in entries if mask is not None], together=isinstance(masks, Tensor))
+        supports = _supports(used)
+        known = iter(supports)
         boxes = [[0, 0, 0, 0] if mask is None else next(known) for mask in entries]
-        like = next(mask for mask in (*masks, masks) if isinstance(mask, Tensor))
-        height, width = (int(n) for n in like.shape[-2:])
-        parts = [mask[v0:v1, u0:u1] for mask, (u0, v0, u1, v1) in zip(entries, boxes, strict=True) if mask is not None]
+        parts = [mask[v0:v1, u0:u1] for mask, (u0, v0, u1, v1) in zip(used, supports, strict=True)]
+        like = first.new_zeros(0, dtype=torch.bool if first.dtype == torch.uint8 else first.dtype)
+        height, width = (int(n) for n in first.shape[-2:])
         return cls._checked(name, parts, boxes, (height, width), like)
 
     @classmethod
@@ -110,7 +115,7 @@ class MaskCrops(TensorRecord):
             >>> MaskCrops.of_boxes([((100, 50, 180, 80), inside)], (120, 400), head).dense().shape
             torch.Size([1, 120, 400])
         """
-        boxes = [_whole_box(f"crops[{row}]", box) for row, (box, _) in enumerate(crops)]
+        boxes = _whole_boxes([box for box, _ in crops])
         parts = [as_tensor(pixels) for _, pixels in crops]
         for row, ((u0, v0, u1, v1), part) in enumerate(zip(boxes, parts, strict=True)):
             _check_mask(f"crops[{row}]", part, (v1 - v0, u1 - u0), "the mask is (v1 - v0, u1 - u0) of its box")
@@ -148,6 +153,7 @@ class MaskCrops(TensorRecord):
 
     def __getitem__(self, row: int) -> Tensor:
         """One mask (H, W), zero where there is none."""
+        row = range(len(self))[row]
         u0, v0, u1, v1 = self._boxes[row]
         height, width = self.size_hw
         return torch.nn.functional.pad(self.crop(row), (u0, width - u1, v0, height - v1))
@@ -157,6 +163,7 @@ class MaskCrops(TensorRecord):
 
     def crop(self, row: int) -> Tensor:
         """The pixels (h, w) of one mask inside its box."""
+        row = range(len(self))[row]
         u0, v0, u1, v1 = self._boxes[row]
         # Made anew each time: a view that is kept from a region without gradients would have none later.
         return self.values.narrow(0, self._starts[row], (v1 - v0) * (u1 - u0)).view(v1 - v0, u1 - u0)
@@ -183,6 +190,7 @@ class MaskCrops(TensorRecord):
 
     def where(self, present: Tensor) -> Self:
         """The masks where `present` (B,) holds; the other instances have none."""
+        check_shape("present", present, (len(self),), kind="flags")
         parts = [self.crop(row).view(-1) for row, here in enumerate(present.tolist()) if here]
         values = torch.cat(parts) if parts else self.values[:0]
         return type(self)(values, self.boxes * present[:, None].to(self.boxes), self.size_hw)
@@ -244,9 +252,16 @@ def _extents(
     corners: Tensor,  # (B, 2) u and v of the upper left pixel of each
 ) -> Tensor:
     """Boxes (B, 4) int64 around what is not zero, half open, 0 without any."""
-    u0, u1 = _first_and_end([crop.any(dim=0) for crop in crops], corners[:, 0])
-    v0, v1 = _first_and_end([crop.any(dim=1) for crop in crops], corners[:, 1])
+    u0, u1 = _first_and_end([_any(crop, 0) for crop in crops], corners[:, 0])
+    v0, v1 = _first_and_end([_any(crop, 1) for crop in crops], corners[:, 1])
     return torch.stack([u0, v0, u1, v1], dim=1)
+
+
+def _any(mask: Tensor, dim: int) -> Tensor:
+    """`mask.any(dim)`, which PyTorch takes seven times longer for than for the largest of bytes."""
+    if mask.dtype != torch.bool or not mask.shape[dim]:
+        return mask.any(dim=dim)
+    return mask.view(torch.uint8).amax(dim=dim).bool()
 
 
 def _first_and_end(
@@ -274,25 +289,25 @@ def _flags(name: str, present: Given, count: int) -> Tensor:
     return flags
 
 
-def _foreground_of(name: str, masks: Masks) -> Tensor | list[Tensor | None]:
-    """Masks (B, H, W), or B that are (H, W) or None, in bool or floating point."""
-    masks = masks if isinstance(masks, (list, tuple)) else as_tensor(masks)
+def _entries(name: str, masks: Tensor | Sequence[Tensor | NDArray[Any] | None]) -> list[Tensor | None]:
+    """Each mask (H, W) as it is given, or None."""
     if isinstance(masks, Tensor):
         _check_mask(name, masks, ("B", "H", "W"))
-        return _foreground([masks])[0]
+        return list(masks)
     if not isinstance(masks, (list, tuple)):
         expected = "masks (B, H, W), or B entries that are (H, W) or None"
         raise InputError(name, expected, type(masks).__name__, "stack the masks of the cars")
-    given = {row: as_tensor(mask) for row, mask in enumerate(masks) if mask is not None}
-    for row, mask in given.items():
-        _check_mask(f"{name}[{row}]", mask, ("H", "W"))
-    sizes = {tuple(mask.shape) for mask in given.values()}
+    entries = [None if mask is None else as_tensor(mask) for mask in masks]
+    given = [mask for mask in entries if mask is not None]
+    for row, mask in enumerate(entries):
+        if mask is not None:
+            _check_mask(f"{name}[{row}]", mask, ("H", "W"))
+    sizes = {tuple(mask.shape) for mask in given}
     if len(sizes) != 1:
         got = f"{len(masks)} entries of sizes {sorted(sizes)}"
         cure = "where no car has a mask give MaskCrops.none(number of cars, (H, W), like=boxes)"
         raise InputError(name, "masks of one size (H, W), or None where a car has none", got, cure)
-    found = dict(zip(given, _foreground(list(given.values())), strict=True))
-    return [found.get(row) for row in range(len(masks))]
+    return entries
 
 
 def _check_mask(name: str, mask: Tensor, shape: Sequence[int | str], cure: str = "") -> None:
@@ -301,25 +316,36 @@ def _check_mask(name: str, mask: Tensor, shape: Sequence[int | str], cure: str =
     check_shape(name, mask, shape, cure, "number" if is_bytes else "mask")
 
 
-def _foreground(masks: Sequence[Tensor]) -> list[Tensor]:
-    """Masks in bytes, 0 and 1 or shades of grey, as bool or probabilities; others as they are."""
-    is_bytes = [mask.dtype == torch.uint8 for mask in masks]
-    shades = [(mask > 1).any() for mask, here in zip(masks, is_bytes, strict=True) if here]
-    is_grey = iter(torch.stack(shades).tolist() if shades else [])
-    return [
-        mask if not here else mask.float() / 255 if next(is_grey) else mask.bool()
-        for mask, here in zip(masks, is_bytes, strict=True)
-    ]
+def _foreground(masks: Sequence[Tensor], together: bool = False) -> list[Tensor]:
+    """Masks in bytes, 0 and 1 or shades of grey, as bool or probabilities; others as they are.
+
+    `together`: shades of grey in one of them say that all have some.
+    """
+    of_bytes = [mask for mask in masks if mask.dtype == torch.uint8]
+    has_shades = torch.stack([(mask > 1).any() for mask in of_bytes]).tolist() if of_bytes else []
+    is_grey = iter([any(has_shades)] * len(of_bytes) if together else has_shades)
+
+    def converted(mask: Tensor) -> Tensor:
+        if mask.dtype != torch.uint8:
+            return mask
+        return mask.float() / 255 if next(is_grey) else mask.bool()
+
+    return [converted(mask) for mask in masks]
 
 
-def _whole_box(name: str, box: Given) -> list[int]:
-    """A box u0, v0, u1, v1, half open; raises `InputError` where this is none in whole pixels."""
-    numbers = as_tensor(box).tolist()
-    fits = len(numbers) == 4 and all(float(number).is_integer() for number in numbers)
-    if not fits or numbers[2] < numbers[0] or numbers[3] < numbers[1]:
-        expected = "a box u0, v0, u1, v1 in whole pixels, half open"
-        raise InputError(name, expected, shown(numbers), "round its corners before you resample the mask to its size")
-    return [int(number) for number in numbers]
+def _whole_boxes(boxes: Sequence[Given]) -> list[list[int]]:
+    """Boxes u0, v0, u1, v1, half open; raises `InputError` for one that is none in whole pixels."""
+    tensors = [as_tensor(box) for box in boxes]
+    for row, tensor in enumerate(tensors):
+        check_shape(f"crops[{row}]", tensor, (4,), "give its box u0, v0, u1, v1 first")
+    # One wait for the device for all of them.
+    numbers = torch.stack([tensor.double() for tensor in tensors]).tolist() if tensors else []
+    for row, (u0, v0, u1, v1) in enumerate(numbers):
+        if not all(number.is_integer() for number in (u0, v0, u1, v1)) or u1 < u0 or v1 < v0:
+            expected = "a box u0, v0, u1, v1 in whole pixels, half open"
+            cure = "round its corners before you resample the mask to its size"
+            raise InputError(f"crops[{row}]", expected, str([u0, v0, u1, v1]), cure)
+    return [[int(number) for number in box] for box in numbers]
 
 
 def _supports(masks: Sequence[Tensor]) -> list[list[int]]:

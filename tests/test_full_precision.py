@@ -133,7 +133,7 @@ def test_gradients_reach_tensors_of_half_precision() -> None:
 
 
 @pytest.mark.parametrize("device", ["cpu", "xpu", "mps"])
-def test_autocast_is_off_inside_on_every_kind_of_device(device: str) -> None:
+def test_autocast_of_other_devices_is_off_inside(device: str) -> None:
     with torch.autocast(device, dtype=torch.float16):
         with full_precision():
             assert not torch.is_autocast_enabled(device)

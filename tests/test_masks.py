@@ -91,6 +91,28 @@ def test_masks_come_in_whatever_form_users_have(mask: Any) -> None:
     assert len(some.values) == 6
 
 
+def test_rows_count_from_the_end_too() -> None:
+    masks = torch.zeros(3, 4, 6)
+    for row in range(3):
+        masks[row, 1:3, row : row + 3] = 0.5 + torch.rand(2, 3)
+    crops = MaskCrops.of(masks)
+    for row in range(-3, 3):
+        assert crops[row].equal(masks[row])
+        assert crops.crop(row).equal(masks[row, 1:3, row % 3 : row % 3 + 3])
+    with pytest.raises(IndexError):
+        crops[3]
+    with pytest.raises(InputError, match=r"present: expected shape \(3,\), got \(1,\)"):
+        crops.where(torch.tensor([True]))
+
+
+def test_whether_bytes_are_shades_of_grey_the_masks_that_are_there_say() -> None:
+    masks = torch.tensor([[[1, 0], [1, 1]], [[200, 0], [0, 0]]], dtype=torch.uint8)
+    assert MaskCrops.of(masks, [True, False]).areas.tolist() == [3, 0]
+    assert MaskCrops.of(masks).areas.tolist() == [0, 1]
+    assert MaskCrops.of(list(masks)).areas.tolist() == [3, 1]
+    assert MaskCrops.of(masks, [False, False]).values.dtype == torch.bool
+
+
 def test_absent_masks_are_never_read() -> None:
     masks = torch.full((2, 4, 6), torch.nan)
     masks[0] = 0.0
@@ -212,7 +234,9 @@ def test_masks_known_in_boxes_alone(box: Any, pixels: Any, expected: Any) -> Non
         (BOX, INSIDE * 9, torch.zeros(1), r"crops: expected foreground probabilities .* 9 in mask 1; apply a sigmoid"),
         (BOX, INSIDE.astype(np.int64), torch.zeros(1), r"crops\[1\]: expected bool, or foreground probabilities"),
         ((2.5, 1, 5, 3), INSIDE, torch.zeros(1), r"crops\[1\]: expected a box u0, v0, u1, v1 in whole pixels.*2.5"),
-        ((2, 1, 5), INSIDE, torch.zeros(1), r"crops\[1\]: expected a box u0, v0, u1, v1 in whole pixels"),
+        ((2, 1, 5), INSIDE, torch.zeros(1), r"crops\[1\]: expected shape \(4,\), got \(3,\); give its box"),
+        (None, INSIDE, torch.zeros(1), r"crops\[1\]: expected a tensor of shape \(4,\), got NoneType; give its box"),
+        (5, INSIDE, torch.zeros(1), r"crops\[1\]: expected shape \(4,\), got \(\); give its box"),
         ((4, 1, 7, 3), INSIDE, torch.zeros(1), r"boxes: expected half open boxes within 6 x 4 pixels"),
         ((5, 3, 2, 1), INSIDE, torch.zeros(1), r"crops\[1\]: expected a box u0, v0, u1, v1 in whole pixels"),
         (BOX, INSIDE, torch.zeros(1, dtype=torch.bool), r"like: expected floating point, .*got torch.bool"),

@@ -171,10 +171,14 @@ def _frames_of(before: Path, after: Path) -> tuple[str, ...]:
     of_sequence: dict[str, list[str]] = {}
     for stem in results:
         of_sequence.setdefault(stem.rpartition("_")[0], []).append(stem)
-    if stems := files_of_frames(before):
-        return tuple(frame for stem in stems for frame in of_sequence.get(stem, [stem]))
-    folders = [sequence for sequence in of_sequence if sequence and (before / sequence).is_dir()]
-    return tuple(frame for sequence in folders for frame in of_sequence[sequence])
+    names = {
+        *files_of_frames(before),
+        *(path.name for path in before.iterdir() if path.is_dir() and path.name[0] != "."),
+    }
+    # What has neither a digit in its name nor results, README.txt, is no frame.
+    names = {name for name in names if name in of_sequence or name in results or any(map(str.isdigit, name))}
+    folders = {name for name in names if (before / name).is_dir() and name not in of_sequence}
+    return tuple(frame for name in sorted(names - folders) for frame in of_sequence.get(name, [name]))
 
 
 def _cars_of_frame(sources: tuple[Path, Path, Path], frame_id: str) -> tuple[list[ComparedCar], int]:

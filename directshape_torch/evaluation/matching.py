@@ -38,14 +38,16 @@ def match_to_labels(detections: Sequence[KittiObject], labels: Sequence[KittiObj
     """The label of each detection that has one, by its place: largest 2D overlap of at least 0.3 first, one to one.
 
     A detection without a 2D box takes the nearest label within 4 m instead: LiDAR detectors write one without an area,
-    or the same for all detections. Another one whose 2D box touches no label's takes a label within 0.8 m. Labels of
-    every class with a 3D box compete, so that a detection of a van is not given to the car behind it; which of the
-    matched labels count is another question (`is_counted`). Of equal overlaps the first detection's is taken.
+    at the corner of the image, or the same for all detections. Another one whose 2D box touches no label's takes a
+    label within 0.8 m. Labels of every class with a 3D box compete, so that a detection of a van is not given to the
+    car behind it; which of the matched labels count is another question (`is_counted`). Of equal overlaps the first
+    detection's is taken.
     """
     known = [label for label in labels if label.has_box_3d]
-    overlap = box_iou(_image_boxes(detections), _image_boxes(known))
+    boxes = own_boxes_2d(detections)
+    overlap = box_iou(boxes, _image_boxes(known))
     touches = (overlap > 0).any(axis=1, keepdims=True)
-    reach_m = np.where((own_boxes_2d(detections) == 0).all(axis=1), _REACH_M, _CERTAIN_REACH_M)
+    reach_m = np.where((boxes[:, 2:] > boxes[:, :2]).all(axis=1), _CERTAIN_REACH_M, _REACH_M)
     # Above all closenesses, so that 2D overlaps come first.
     overlap = np.where(
         touches, np.where(overlap >= _MINIMUM_IOU_2D, 1 + overlap, 0), _closeness(detections, known, reach_m)
@@ -115,7 +117,7 @@ def chosen_frames(
         DataFormatError: the file cannot be read.
     """
     if split is not None:
-        known = frames_of_split(split, known)
+        known = frames_of_split(split, known, sequence=None)
     chosen = list(known) if frames is None else frames_among(known, frames, expected)
     if not chosen:
         raise InputError("frames", f"at least one of the {expected}", "none", "check the choice of frames")

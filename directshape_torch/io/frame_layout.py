@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Protocol
@@ -150,7 +150,7 @@ def frames_among(known: Sequence[str], wanted: Iterable[str | int], expected: st
 
 
 def frames_of_split(
-    path: Path | str, known: Sequence[str], exists: Callable[[str], bool] = lambda _: False, sequence: str = ""
+    path: Path | str, known: Sequence[str], exists: Callable[[str], bool] = lambda _: False, sequence: str | None = ""
 ) -> list[str]:
     """The frames that the lines of a file name, each once.
 
@@ -161,7 +161,8 @@ def frames_of_split(
         path: the file.
         known: frames with detections.
         exists: whether there is a frame of a name; one without detections is reported when its turn comes.
-        sequence: whose frames have numbers alone; lines that name a folder must name this one.
+        sequence: whose frames have numbers alone: of lines of several words the first one must name it, and the second
+            one names the frame. "" where frames belong to no sequence or say to which; None: any first word will do.
 
     Raises:
         DataFormatError: a line names no frame.
@@ -170,8 +171,8 @@ def frames_of_split(
     chosen = []
     for line in read_lines(path):
         folder, *others = (PurePath(word).name for word in line.text.split())
-        of_drive = [f"{folder}_{word}" for word in others[:1]] + others[:1] * (folder == sequence)
-        words = [line.text, *of_drive, folder]
+        other = next(iter(others), "")
+        words = [line.text, f"{folder}_{other}", _frame_word(folder, other, sequence, found)]
         names = [name for word in words for name in (word, _without_ending(word))]
         keys = [key for name in names for key in (name, _key(name)) if key in found]
         unknown = [name for name in names if is_frame_id(name) and exists(name)] if not keys else []
@@ -180,6 +181,13 @@ def frames_of_split(
             raise line.error(path, "names no frame of the data", f"write one id a line{example}")
         chosen.append(found[keys[0]] if keys else unknown[0])
     return list(dict.fromkeys(chosen))
+
+
+def _frame_word(folder: str, other: str, sequence: str | None, found: Mapping[str, str]) -> str:
+    """Which of the first two words of a line names a frame of the sequence, or "" where they are of another one."""
+    if sequence == "" or not {_key(other), _key(_without_ending(other))} & found.keys():
+        return folder
+    return other if sequence in (None, folder) else ""
 
 
 def _by_name(known: Sequence[str]) -> dict[str, str]:

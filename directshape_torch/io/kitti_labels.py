@@ -74,10 +74,13 @@ def parse_object(path: Path | str, line: Line, is_label: bool = False) -> KittiO
 
 
 def own_boxes_2d(objects: Sequence[KittiObject]) -> NDArray[np.float64]:  # (N, 4)
-    """The 2D boxes of objects, zeros for what is none: -1, zeros, or the same numbers for several of them."""
+    """The 2D boxes of objects, zeros for what is none.
+
+    That is -1, zeros, the same numbers for several objects, or a corner of the image: no car ends above it and beside.
+    """
     boxes = np.array([o.box_2d for o in objects], dtype=np.float64).reshape(-1, 4)
     _, number_of, counts = np.unique(boxes, axis=0, return_inverse=True, return_counts=True)
-    is_none = (boxes <= 0).all(axis=1) | (counts[number_of.reshape(-1)] > 1)
+    is_none = (boxes[:, :2] <= 0).all(axis=1) | (counts[number_of.reshape(-1)] > 1)
     return np.where(is_none[:, None], 0.0, boxes)
 
 
@@ -135,21 +138,25 @@ def read_tracking_objects(path: Path | str) -> dict[int, list[KittiObject]]:
 def objects_path(source: Path, frame_id: str) -> Path:
     """The file of a frame `FRAME` or `SEQUENCE_NNNNNN`.
 
-    `source` is a folder of `FRAME.txt`, `SEQUENCE.txt` or `SEQUENCE/NNNNNN.txt`, or one with `data` of these, or the
-    file of a sequence.
+    `source` is the file of a sequence, or a folder of `FRAME.txt`, `SEQUENCE.txt` or `SEQUENCE/NNNNNN.txt`; the files
+    may lie in a folder `data` there. `FRAME` may leave out `_10`, the end of the first pair in KITTI Stereo 2015.
     """
     sequence, _, number = frame_id.rpartition("_")
-    of_frame, of_sequence = file_of_frame(source, f"{frame_id}.txt"), file_of_frame(source, f"{sequence}.txt")
-    others = (
-        [source, of_sequence, file_of_frame(source / sequence, f"{number}.txt")] if sequence or source.is_file() else []
-    )
-    return next((path for path in (of_frame, *others) if path.is_file()), of_frame)
+    names = dict.fromkeys([frame_id, frame_id.removesuffix("_10"), *([sequence] if sequence else [])])
+    places = [file_of_frame(source, f"{name}.txt") for name in names]
+    places += [file_of_frame(source / sequence, f"{number}.txt")] if sequence else []
+    return next((path for path in (source, *places) if path.is_file()), places[0])
 
 
 def objects_in(path: Path, *names: str) -> list[KittiObject]:
-    """The objects of a frame in a file called as the frame or its number, else in one of the tracking benchmark."""
+    """The objects of a frame in a file called as the frame, else in one of the tracking benchmark.
+
+    A file called by its number in the folder of its sequence is one of the frame.
+    """
     sequence, _, number = names[0].rpartition("_")
-    if is_called(path, names) or (is_called(path, [number]) and number != sequence):
+    folder = path.parent.parent if path.parent.name == "data" else path.parent
+    is_in_sequence = bool(sequence) and folder.name == sequence and is_called(path, [number])
+    if is_in_sequence or is_called(path, (*names, names[0].removesuffix("_10"))):
         return read_objects(path)
     # A list of the caller's own, for that of the file is remembered.
     return [*read_tracking_objects(path).get(frame_number(names[0]), [])]

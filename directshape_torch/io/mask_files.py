@@ -116,7 +116,7 @@ class InstancePngMasks:
         if ids.dtype == np.uint8 and values[-1]:
             problem = f"has 8 bits and numbers up to {values[-1]}, where class * 1000 + instance does not fit"
             raise DataFormatError(path, problem, cure="write 16 bits: 1000 * class + instance, car 1 or 26")
-        per_class = _ids_per_class(values)
+        per_class = _ids_per_class(values, self.car_ids | _KNOWN_CLASSES)
         for value in values:
             category, number = divmod(value, per_class)
             is_stuff = per_class == _IDS_PER_SEMANTIC_CLASS and (category < _FIRST_THING or not number)
@@ -126,10 +126,10 @@ class InstancePngMasks:
             yield InstanceMask.found(side, value, category in self.car_ids, ids == value, track_id=track)
 
 
-def _ids_per_class(values: Sequence[int]) -> int:
+def _ids_per_class(values: Sequence[int], classes: frozenset[int]) -> int:
     """By what classes are multiplied in an image of such numbers: 1000, or 256 where those fit and these do not."""
     plain, semantic = ([divmod(value, base) for value in values] for base in (_IDS_PER_CLASS, _IDS_PER_SEMANTIC_CLASS))
-    known = all(category in _KNOWN_CLASSES and number < _MOST_INSTANCES for category, number in plain)
+    known = all(category in classes and number < _MOST_INSTANCES for category, number in plain)
     fits = all(category <= _HIGHEST_CLASS for category, _ in semantic)
     has_things = any(category >= _FIRST_THING and number for category, number in semantic)
     is_stuff = not any(number for _, number in semantic)

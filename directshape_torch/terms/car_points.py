@@ -78,7 +78,7 @@ def _pixels(frames: FrameBatch, d: Detections) -> Iterator[Tensor]:
     boxes = d.box_2d.detach().double().cpu()
     corners = torch.cat([boxes[:, :2].ceil(), boxes[:, 2:].floor() + 1], dim=1).clamp(min=0)
     corners[boxes.isnan().any(dim=1)] = 0
-    part = [d.frame_index.new_zeros(3, 0)]
+    part, num_pixels = [d.frame_index.new_zeros(3, 0)], 0
     for car, (height, width) in enumerate(sizes):
         # Whatever the padding of a smaller frame holds is no part of it.
         if has_mask[car]:
@@ -90,9 +90,10 @@ def _pixels(frames: FrameBatch, d: Detections) -> Iterator[Tensor]:
             pixels = d.frame_index.new_ones(max(0, v1 - v0), max(0, u1 - u0))
         v, u = pixels.nonzero().unbind(1)
         part.append(torch.stack([torch.full_like(v, car), v + v0, u + u0]))
-        if sum(each.shape[1] for each in part) > _MOST_PIXELS:
+        num_pixels += len(v)
+        if num_pixels > _MOST_PIXELS:
             yield torch.cat(part, dim=1)
-            part = part[:1]
+            part, num_pixels = part[:1], 0
     yield torch.cat(part, dim=1)
 
 

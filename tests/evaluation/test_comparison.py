@@ -12,6 +12,7 @@ from helpers.shape_arrays import shape_arrays
 from directshape_torch.cli.main import main
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.comparison import compare_results
+from directshape_torch.evaluation.matching import chosen_frames, objects_of_frame
 from directshape_torch.evaluation.reports import format_comparison
 from directshape_torch.io.result_files import ShapeArrays, write_shapes
 
@@ -177,8 +178,43 @@ def test_files_of_the_tracking_benchmark(folders: tuple[Path, Path, Path], tmp_p
     apart.parent.mkdir()
     (folders[1] / "data").rename(apart)
     assert compare_results(sequences[0], apart.parent, folders[2]).cars == several.cars
+    # Folders and files beside each other, whatever else lies there.
+    lines = (apart / "000002.txt").read_text().splitlines()
+    (apart / "000002.txt").unlink()
+    (folders[2] / "0005_000002.txt").rename(folders[2] / "0006_000002.txt")
+    (apart.parent / "0006.txt").write_text("".join(f"2 7 {line}\n" for line in lines))
+    (apart.parent / "README.txt").write_text("Detections.\n")
+    (sequences[0] / "0006.txt").write_text((sequences[0] / "0005.txt").read_text())
+    mixed = compare_results(sequences[0], apart.parent, folders[2])
+    assert [(car.before, car.after) for car in mixed.cars] == expected
+    (folders[2] / "0006_000002.txt").rename(folders[2] / "0005_000002.txt")
     with pytest.raises(InputError, match="such as 0005_000001, got 0005_first"):
         compare_results(*sequences, folders[2], frames=["0005_first"])
+
+
+def test_files_of_stereo_2015_may_leave_out_which_pair_they_are_of(folders: tuple[Path, Path, Path]) -> None:
+    expected = compare_results(*folders)
+    for path in list(folders[2].iterdir()):
+        path.rename(path.with_name(f"{path.stem}_10.txt"))
+    found = compare_results(*folders)
+    assert [(car.before, car.after) for car in found.cars] == [(car.before, car.after) for car in expected.cars]
+    assert found.cars[0].frame_id == "000001_10"
+
+
+@pytest.mark.parametrize(("file", "frame"), [("000007/000007.txt", "000007_000007"), ("3/data/000007.txt", "3_000007")])
+def test_a_file_in_the_folder_of_its_sequence_is_one_of_a_frame(tmp_path: Path, file: str, frame: str) -> None:
+    (tmp_path / file).parent.mkdir(parents=True)
+    (tmp_path / file).write_text(_line("near", 0, 8, score="0.5") + "\n")
+    assert len(objects_of_frame(tmp_path, frame)) == 1
+    # A file of the tracking benchmark may be called as a frame of another sequence.
+    (tmp_path / "000008.txt").write_text("7 1 " + _line("near", 0, 8, score="0.5") + "\n")
+    assert len(objects_of_frame(tmp_path / "000008.txt", "0005_000007")) == 1
+
+
+def test_a_split_of_drives_serves_the_evaluation(tmp_path: Path) -> None:
+    """Which drive its files are of, nobody says there."""
+    (tmp_path / "split.txt").write_text("2011_09_26/2011_09_26_drive_0005_sync 0000000007 l\n")
+    assert chosen_frames(["0000000005", "0000000007"], None, tmp_path / "split.txt", "frames") == ["0000000007"]
 
 
 def test_command_prints_and_writes(

@@ -22,7 +22,9 @@ def test_the_better_detection_takes_the_label():
     assert match_to_labels(detections, labels) == {1: labels[0]}
 
 
-@pytest.mark.parametrize("box", [(-1, -1, -1, -1), (0, 0, 0, 0), (0, 0, 50, 50)])
+@pytest.mark.parametrize(
+    "box", [(-1, -1, -1, -1), (0, 0, 0, 0), (0, 0, 50, 50), (0, 0, 1241, 374), (150, 150, 150, 150), (50, 50, 0, 0)]
+)
 def test_a_detection_without_a_2d_box_takes_the_nearest_label(box):
     """What LiDAR detectors write: 1 and 2 m from the second label, 5 m from either."""
     labels = [_object((100, 100, 200, 200), x=0.0), _object((300, 100, 400, 200), x=8.0)]
@@ -30,14 +32,15 @@ def test_a_detection_without_a_2d_box_takes_the_nearest_label(box):
     assert match_to_labels([near, nearer, far], labels) == {1: labels[1]}
     with_box = _object((300, 100, 400, 200), x=20.0)
     assert match_to_labels([nearer, with_box], labels) == {1: labels[1]}
-    # Half a metre away it is the same car whatever its box says.
-    assert match_to_labels([_object(box, x=8.5)], labels) == {0: labels[1]}
+    assert match_to_labels([nearer], labels) == {0: labels[1]}
 
 
 def test_a_detection_with_a_2d_box_of_its_own_takes_no_label_that_this_misses():
     """A false positive beside a car that nobody detected."""
     label = _object((100, 100, 200, 200), x=0.0)
     assert match_to_labels([_object((250 + x, 100, 360, 200), x=x) for x in (1.0, 3.9)], [label]) == {}
+    # Half a metre away it is the same car whatever its box says.
+    assert match_to_labels([_object((260, 100, 360, 200), x=0.5)], [label]) == {0: label}
     assert match_to_labels([], [label]) == match_to_labels([label], []) == {}
 
 

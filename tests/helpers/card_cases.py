@@ -156,7 +156,11 @@ def waits_of_masks() -> dict[str, Any]:
         "dense": MaskCrops.of,
         "entries": lambda masks: MaskCrops.of([None, *masks]),
         "bytes": lambda masks: MaskCrops.of(list((masks * 255).byte())),
-        "boxes": lambda masks: MaskCrops.of_boxes([((0, 0, 10, 8), mask) for mask in masks], (8, 10), masks),
+        "boxes": lambda masks: MaskCrops.of_boxes(
+            [*zip(torch.tensor([0, 0, 10, 8]).repeat(len(masks), 1).to(CARD), masks, strict=True)],
+            (8, 10),
+            masks,
+        ),
         "areas and boxes": lambda masks: MaskCrops.of(masks).box_2d,
     }
     counts: dict[str, list[int]] = {}

@@ -200,7 +200,7 @@ def test_a_split_of_drives_where_one_is_open(kitti: Path, tmp_path: Path) -> Non
     split = tmp_path / "split.txt"
     write(split, f"{DAY}/{DRIVE} 0000000001 l\n")
     assert open_dataset("raw", drive, detections, masks, split=split).frame_ids == ("0000000001",)
-    for line in (f"{DAY}/2011_09_26_drive_0009_sync 0000000001 l", "frame 1 was bad"):
+    for line in (f"{DAY}/2011_09_26_drive_0009_sync 0000000001 l", "frame 1 was bad", "0001 000000", "1 0"):
         write(split, f"0000000000\n{line}\n")
         with pytest.raises(DataFormatError, match=r"split.txt, line 2: names no frame of the data"):
             open_dataset("raw", drive, detections, masks, split=split)
