@@ -258,6 +258,12 @@ class PriorConfig(Settings):
     dimensions_sigma_m: tuple[float, float, float] = setting(
         (0.1, 0.1, 0.4), "standard deviation of the detector's height, width and length", above=0
     )
+    detector_weight: float = setting(
+        1.0,
+        "weight of the detector's boxes against those of the images where a rig knows what both are off by (see "
+        "docs/derivations/fusion.md); 0: the images' boxes alone",
+        at_least=0,
+    )
     pose_weight: float = setting(
         0.2,
         "weight of the detector's pose, in units of its standard deviations: those of the detections where they have "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -19,6 +20,7 @@ from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.gradient_mode import is_within_transform
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import check_fit, check_no_tangents, in_dtype_of, refusals
+from directshape_torch.refinement.fusion import fused
 from directshape_torch.refinement.outcome import as_they_came
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.result import RefinementResult
@@ -40,6 +42,10 @@ class KnownRig(Protocol):
 
     def informed(self, frames: FrameBatch, detections: Detections) -> Detections:
         """Detections with what is not known of their depths and of the rig, where they do not say it."""
+        ...
+
+    def detector_sigmas(self, frames: FrameBatch) -> Tensor | None:
+        """Standard deviations (7,) of the detector, see `refinement.fusion.fused`; None where nothing is known."""
         ...
 
 
@@ -133,7 +139,13 @@ class DirectShapeRefiner(nn.Module):
             full_precision(),
             compiling(self.config.compile, len(detections)),
         ):
-            return self._refine(frames, detections, term_weights)
+            result = self._refine(frames, detections, term_weights)
+            # What the images are off by was measured with their own method.
+            if self.rig is None or self.config.method != "direct":
+                return result
+            weight = self.config.priors.detector_weight
+            sigmas = self.rig.detector_sigmas(frames) if weight else None
+            return fused(result, detections, None if sigmas is None else sigmas / math.sqrt(weight))
 
     def _warn_of(self, frames: FrameBatch, detections: Detections) -> None:
         """Mistakes that the tensors of this call show, as the setting `check` asks."""

@@ -29,8 +29,9 @@ class Status(enum.Enum):
         "calibration, or set both probabilities of `acceptance` to 0 to have it all the same"
     )
     no_evidence = (
-        "nothing in the images confirms the result, so the input is returned: its shape misses the masks, hardly any "
-        "pixel can be compared, or the depth is unknown by a fifth; check units and frame of boxes, masks, calibration"
+        "nothing in the images confirms the result, so the input is returned: its shape misses the masks, its pixels "
+        "match elsewhere or nowhere, or the depth is unknown by a fifth; check units and frame of boxes, masks, "
+        "calibration"
     )
 
     @property

@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
+from directshape_torch.batch.learn_detector import learn_detector
 from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.batch.refine_dataset import check_out_dir, refine_dataset
 from directshape_torch.batch.run_summary import format_summary
@@ -31,6 +32,8 @@ from directshape_torch.data_check.check_dataset import check_frames
 from directshape_torch.errors import InputError
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.io.stereo_dataset import StereoDataset
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.rig.detector_noise import in_words
 from directshape_torch.rig.estimate import RigEstimate, RigEstimates
 from directshape_torch.rig.from_files import estimate_rigs
 from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, known_rigs, load_rigs, save_rigs
@@ -119,6 +122,11 @@ def run(args: argparse.Namespace) -> int:
         refiner.rig = RigEstimates(rigs)
         if refiner.config.method == "direct":
             _say_where_rigs_are_guesses(rigs)
+            _learn(dataset, refiner, refiner.rig)
+        for estimate in rigs if are_new else []:
+            print(estimate)
+        if (sigmas := refiner.rig.detector_sigmas()) is not None:
+            print(f"detector: off by {in_words(sigmas)}, from {len(refiner.rig.results)} results")
     with _Progress(args.out, rigs if are_new else None) as progress:
         summary = refine_dataset(dataset, refiner, args.out, options, progress, fresh=args.fresh)
     for warning in summary.warnings:
@@ -161,9 +169,14 @@ def _rigs_of_run(dataset: StereoDataset, rig: str, out_dir: Path, fresh: bool) -
         return kept, False
     with Bar(desc="rig", unit="frame") as bar:
         rigs = estimate_rigs(dataset, lambda _: bar.update())
-    for estimate in rigs:
-        print(estimate)
     return rigs, True
+
+
+def _learn(dataset: StereoDataset, refiner: DirectShapeRefiner, rigs: RigEstimates) -> None:
+    """Let the rigs learn what the detector is off by, where they do not know it."""
+    if refiner.config.priors.detector_weight and rigs.detector_sigmas() is None:
+        with Bar(desc="detector", unit="frame") as bar:
+            learn_detector(dataset, refiner, rigs, lambda _: bar.update())
 
 
 def _say_where_rigs_are_guesses(rigs: Sequence[RigEstimate]) -> None:

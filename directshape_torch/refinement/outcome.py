@@ -41,6 +41,10 @@ _SETTLED_SHARE = 0.005
 _LEAST_MASK_IOU = 0.65
 # Of these cars at least 0.68 of the pixels could be compared.
 _LEAST_MATCHED_SHARE = 0.1
+# How far from where it ended the pixels of a car may have their best disparity, and how sharply they must know it,
+# pixels. Most boxes and masks that are laid on other images break one of both, of cars that are there one or two in a
+# hundred (scripts/calibrate_fusion.py, column "elsewhere").
+_LARGEST_OFFSET_PX, _LARGEST_OFFSET_SIGMA_PX = 0.75, 0.5
 # Sigma along the viewing ray over the depth; of these cars at most 0.1.
 _LARGEST_DEPTH_SHARE = 0.2
 
@@ -209,7 +213,7 @@ def promised_decrease(minimum: Minimum[CarState]) -> Tensor:
 
 
 def has_evidence(end: CarState, found: RefinementResult) -> Tensor:
-    """Whether the images confirm the states (B,) at the end: masks, compared pixels, a depth that is known."""
+    """Whether the images confirm the states (B,) at the end: masks, compared pixels that match there, a known depth."""
     quality, location = found.quality, se3.inverse(end.T_obj_cam)[:, :3, 3]
     left = quality.mask_iou_left
     iou = torch.where(left.isnan(), quality.mask_iou_right, left)
@@ -219,7 +223,9 @@ def has_evidence(end: CarState, found: RefinementResult) -> Tensor:
         seen = seen & (iou >= _LEAST_MASK_IOU)
     if "photometric" in found.term_names:
         # Its pixels are those of the left mask.
-        seen = seen & ((quality.matched_share >= _LEAST_MATCHED_SHARE) | left.isnan())
+        at_end = found.profile.after
+        is_there = (at_end.offset_px.abs() < _LARGEST_OFFSET_PX) & (at_end.sigma_px < _LARGEST_OFFSET_SIGMA_PX)
+        seen = seen & (((quality.matched_share >= _LEAST_MATCHED_SHARE) & is_there) | left.isnan())
     return seen
 
 

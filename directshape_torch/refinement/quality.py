@@ -76,8 +76,9 @@ class FitQuality(CarRecord):
         evidence: (B, E) what is known of the refinement's course, columns `EVIDENCE_NAMES`.
         probability_better: (B,) calibrated probability that the refined box overlaps the true one more than the input
             does, seen from above; NaN for all methods but "direct".
-        probability_not_worse: (B,) that its overlap is at least the input's less 0.05. Figures of cars whose status is
-            `not_trusted` speak of the refinement that was not returned.
+        probability_not_worse: (B,) that its overlap is at least the input's less 0.05. Both speak of the images' box,
+            also where it was brought together with the detector's, and figures of cars whose status is `not_trusted` of
+            the refinement that was not returned.
     """
 
     mask_iou_left: Annotated[Tensor, Dense("B")]

@@ -23,6 +23,7 @@ from directshape_torch.numerics.conversion import working_dtype
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.records import CarRecord, Dense
 from directshape_torch.refinement.disparity_profile import DisparityProfile
+from directshape_torch.refinement.fusion import DetectorComparison
 from directshape_torch.refinement.observability import Observability
 from directshape_torch.refinement.quality import FitQuality, bundled_trust_model
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -83,6 +84,8 @@ class RefinementResult(CarRecord):
         observability: what its view does not show; `observability.words()` says it in words.
         profile: photometric cost over the disparity at input and end; of `not_trusted` cars at the end that was not
             returned.
+        comparison: how far the images' box of each refined car and the detector's lie apart, and what is known of the
+            box that both give together; NaN from a refiner without a rig.
         input_dimensions_hwl: (B, 3) of the detections, metres.
         ground_source: where the ground plane of each car's frame came from, B entries.
         t_cam_ref: (B, 3) `x_cam = x_ref + t_cam_ref`.
@@ -118,6 +121,7 @@ class RefinementResult(CarRecord):
     quality: FitQuality
     observability: Observability
     profile: DisparityProfile
+    comparison: DetectorComparison
     input_dimensions_hwl: Annotated[Tensor, Dense("B", 3)]
     ground_source: tuple[str, ...]
     t_cam_ref: Annotated[Tensor, Dense("B", 3)]
@@ -308,12 +312,15 @@ class RefinementResult(CarRecord):
     def sigma_xyz_yaw(self) -> Tensor:
         """Calibrated standard deviations (B, 4) of the box's place in `ref` and of its heading, metres and radians.
 
-        NaN for cars that were not refined. Calibrated with the default settings on rendered frames; a rig's own
-        disparity error is in them as far as the covariance of its field, `rig.disparity_sigma_px` or
-        `Detections.offset_sigma_px` says.
+        NaN for cars that were not refined. Calibrated with the default settings: on rendered frames for boxes of the
+        images alone, on KITTI where they were brought together with the detector's. A rig's own disparity error is in
+        them as far as the covariance of its field, `rig.disparity_sigma_px` or `Detections.offset_sigma_px` says.
         """
-        covariance = bundled_trust_model().calibrated_covariance(self.covariance_xyz_yaw, self.T_cam_obj[:, :3, 3])
-        return covariance.diagonal(dim1=1, dim2=2).sqrt()
+        location = self.T_cam_obj[:, :3, 3]
+        of_images = bundled_trust_model().calibrated_covariance(self.covariance_xyz_yaw, location)
+        variances = of_images.diagonal(dim1=1, dim2=2)
+        of_both = self.comparison.variances_xyz_yaw(location)
+        return torch.where(of_both.isfinite(), of_both, variances).sqrt()
 
     @full_precision()
     def mesh(self, index: int) -> trimesh.Trimesh:

@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -15,11 +15,15 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, DisparityField
 from directshape_torch.numerics.checks import check_shape
 from directshape_torch.numerics.conversion import as_floating
+from directshape_torch.rig import detector_noise
 from directshape_torch.rig.detections import COLUMNS, observe_detections
 from directshape_torch.rig.pixels import PixelEvidence, hull
 from directshape_torch.rig.posterior import BIAS, Posterior, solve_offsets, solve_rows
 from directshape_torch.rig.rig import Rig
 from directshape_torch.scene import Detections, FrameBatch
+
+if TYPE_CHECKING:
+    from directshape_torch.refinement.result import RefinementResult
 
 # A service runs for years; so many cars say all that cars can say.
 _MOST_ROWS = 1000
@@ -74,6 +78,7 @@ class RigEstimate(nn.Module):
         matrices = (matrix.detach().double().cpu() for matrix in (K_left, K_right, T_right_cam))
         self._blank = DisparityField.constant(0.0, size_wh, *matrices)
         self.rows = torch.zeros(0, len(COLUMNS), dtype=torch.float64)
+        self.results = torch.zeros(0, detector_noise.COLUMNS, dtype=torch.float64)
         self.pixels: dict[str, PixelEvidence] = {}
         self._solved: tuple[Posterior, DisparityField] | None = None
 
@@ -112,6 +117,35 @@ class RigEstimate(nn.Module):
         """Take in pixels of known depth: `kind` is "lidar", "disparity" or "motion"."""
         before = self.pixels.get(kind)
         self.pixels[kind], self._solved = evidence if before is None else before + evidence, None
+
+    def learn(self, frames: FrameBatch, result: RefinementResult) -> None:
+        """Take in how far refined cars lie from the detector's boxes, which says what these are off by.
+
+        Args:
+            frames: of this rig, that were not learnt from before.
+            result: of a refiner with this estimate, of these frames.
+
+        Raises:
+            InputError: frames of another rig.
+        """
+        for number in range(len(frames)):
+            self._blank.check_rig(*Rig.of_frame(frames, number))
+        known = result.comparison.sigma_images.isfinite().all(dim=1) & (result.track_part < 0)
+        distance = torch.hypot(result.T_cam_obj[:, 0, 3], result.T_cam_obj[:, 2, 3]).double()
+        comparison = result.comparison
+        rows = torch.cat([distance[:, None], comparison.difference, comparison.sigma_images], dim=1)
+        self.add_results(rows[known].detach().cpu())
+
+    def add_results(self, rows: Tensor) -> None:
+        """Take in comparisons of results with detections, (N, 15) `rig.detector_noise.COLUMNS`, else `InputError`."""
+        check_shape("rows", rows, ("N", detector_noise.COLUMNS), kind="floating")
+        if not bool(rows.isfinite().all()) or bool((rows[:, 8:] <= 0).any()):
+            raise InputError("rows", "finite differences and standard deviations above 0", "others")
+        self.results = torch.cat([self.results, rows.detach().to(self.results)])[-_MOST_ROWS:]
+
+    def detector_sigmas(self, frames: FrameBatch | None = None) -> Tensor | None:
+        """Standard deviations (7,) of the detector, see `refinement.fusion.fused`; None where no results are known."""
+        return detector_noise.detector_sigmas(self.results) if len(self.results) else None
 
     @property
     def mean(self) -> Tensor:
@@ -230,7 +264,13 @@ class RigEstimate(nn.Module):
         size_wh, *matrices = (list(part) if isinstance(part, tuple) else part.tolist() for part in self._blank.rig)
         pixels = {kind: {n: _plain(x) for n, x in sums._asdict().items()} for kind, sums in self.pixels.items()}
         rig = dict(zip(("K_left", "K_right", "T_right_cam"), matrices, strict=True))
-        return {"size_wh": size_wh, **rig, "rows": self.rows.tolist(), "pixels": pixels}
+        return {
+            "size_wh": size_wh,
+            **rig,
+            "rows": self.rows.tolist(),
+            "results": self.results.tolist(),
+            "pixels": pixels,
+        }
 
     @classmethod
     def of_content(cls, content: Any) -> Self:
@@ -240,6 +280,8 @@ class RigEstimate(nn.Module):
             sizes = {"K_left": 3, "K_right": 3, "T_right_cam": 4}
             rig = cls((width, height), *(to_tensor(content, name, (n, n)) for name, n in sizes.items()))
             rig.add_rows(to_tensor(content, "rows", (None, len(COLUMNS))))
+            # Files of before know no results.
+            rig.add_results(to_tensor({"results": [], **content}, "results", (None, detector_noise.COLUMNS)))
             for kind, sums in content["pixels"].items():
                 points, frames, *names = PixelEvidence._fields
                 tensors = (to_tensor(sums, name, shape) for name, shape in zip(names, _OF_PIXELS, strict=True))
@@ -260,6 +302,7 @@ class RigEstimate(nn.Module):
         except DAMAGE as error:
             raise InputError("state", "what get_extra_state has made", f"something else ({error})") from error
         self._blank, self.rows, self.pixels, self._solved = other._blank, other.rows, other.pixels, None
+        self.results = other.results
 
     @property
     def _focal_baseline(self) -> float:
@@ -307,6 +350,23 @@ class RigEstimates(nn.ModuleList):
         """See `RigEstimate`."""
         rig = self._of(frames)
         return detections if rig is None else rig.informed(frames, detections)
+
+    def learn(self, frames: FrameBatch, result: RefinementResult) -> None:
+        """See `RigEstimate`; results of a rig that nobody knows say nothing."""
+        rig = self._of(frames)
+        if rig is not None:
+            rig.learn(frames, result)
+
+    @property
+    def results(self) -> Tensor:
+        """(N, 15) of all rigs, for one detector looks through all of them."""
+        known = [rig.results for rig in self if isinstance(rig, RigEstimate)]
+        return torch.cat(known) if known else torch.zeros(0, detector_noise.COLUMNS, dtype=torch.float64)
+
+    def detector_sigmas(self, frames: FrameBatch | None = None) -> Tensor | None:
+        """See `RigEstimate`; by the results of all rigs."""
+        results = self.results
+        return detector_noise.detector_sigmas(results) if len(results) else None
 
     def _of(self, frames: FrameBatch) -> RigEstimate | None:
         rig = Rig.of_frame(frames)

@@ -77,7 +77,7 @@ def _take_in(
     rig, num_seen = _rig_of_first(dataset, frame_ids, rigs), 0
     if rig is None:
         return
-    for frame_id in _evenly(frame_ids):
+    for frame_id in evenly(frame_ids):
         with suppress(DirectShapeError, OSError):
             if not any(found.type in dataset.classes for found in dataset.objects(frame_id)):
                 continue
@@ -100,7 +100,7 @@ def _rig_of_first(dataset: StereoDataset, frame_ids: Sequence[str], rigs: list[R
     return None
 
 
-def _evenly(frame_ids: Sequence[str]) -> list[str]:
+def evenly(frame_ids: Sequence[str]) -> list[str]:
     """All of them, so that the first N are spread over the whole: in the order of their bit-reversed numbers."""
     num_bits = max(1, (len(frame_ids) - 1).bit_length())
     return [frame_ids[k] for k in sorted(range(len(frame_ids)), key=lambda k: f"{k:0{num_bits}b}"[::-1])]

@@ -34,14 +34,19 @@ def test_is_estimated_kept_and_shown(source: Path, tmp_path: Path, capsys: pytes
     printed = capsys.readouterr()
     line = next(line for line in printed.out.splitlines() if line.startswith("rig: "))
     assert "detections hardly show the rig" in printed.err
+    detector = next(line for line in printed.out.splitlines() if line.startswith("detector: off by depth "))
+    assert detector.endswith(" results")
     assert line.endswith("%")
     (rig,) = load_rigs(out / "rig.json")
     assert len(rig.rows) > 1
+    assert len(rig.results) > 1
     assert str(rig) == line
     assert (out / "rig.png").is_file()
     content = (out / "rig.json").read_bytes()
     assert main(command(source, out)) == 0
-    assert f"{line} (kept)" in capsys.readouterr().out
+    again = capsys.readouterr().out
+    assert f"{line} (kept)" in again
+    assert detector in again
     assert (out / "rig.json").read_bytes() == content
     assert json.loads((out / "summary.json").read_text())["sha256"]["stereo_bias"] is not None
     assert main(["report", str(out), "--data", str(source)]) == 0

@@ -243,6 +243,13 @@ def with_rows(rows: Tensor) -> RigEstimate:
     return made
 
 
+def learnt() -> RigEstimate:
+    made = estimate()
+    with torch.no_grad():
+        made.learn(street()[0], DirectShapeRefiner(grids(), refiner().config, rig=made)(*street()))
+    return made
+
+
 def fitted(n: Numbers) -> list[Tensor]:
     chance = torch.Generator().manual_seed(2)
     points = numbers().boxes[:1, :3] + 1.5 * (torch.rand(200, 3, generator=chance, dtype=torch.float32) - 0.5)
@@ -350,6 +357,8 @@ CASES: dict[str, Case] = {
     "DisparityProfile.lowest": lambda _: result().profile.lowest,
     "DisparityProfile.cost_at": lambda _: result().profile.cost_at(0.5),
     "RigEstimate.add_rows": lambda _: with_rows(torch.full((1, 8), 7.3, dtype=torch.float32)).mean,
+    "RigEstimate.learn": lambda _: learnt().results,
+    "RigEstimate.detector_sigmas": lambda _: learnt().detector_sigmas(),
     "RigEstimate.in_the_middle": lambda _: torch.tensor(estimate().in_the_middle(), dtype=torch.float64),
     "RigEstimate.metres_per_pixel": lambda _: torch.tensor(estimate().metres_per_pixel(20.0), dtype=torch.float64),
     "RigEstimate.along_the_width": lambda _: estimate().along_the_width(),
@@ -370,7 +379,8 @@ WITHOUT_NUMBERS = {
     "NeuralShapePrior.load_bundled", "NeuralShapePrior.save", "PCAShapePrior.get_extra_state", "PCAShapePrior.load",
     "PCAShapePrior.load_bundled", "PCAShapePrior.num_codes", "PCAShapePrior.save", "PCAShapePrior.set_extra_state",
     "RefinementResult.refined", "RefinementResult.rows", "RefinementResult.status", "RefinementResult.to",
-    "RigEstimate.add_pixels", "RigEstimate.content", "RigEstimate.get_extra_state", "RigEstimate.is_guess",
+    "RigEstimate.add_pixels", "RigEstimate.add_results", "RigEstimate.content", "RigEstimate.get_extra_state",
+    "RigEstimate.is_guess",
     "RigEstimate.is_of", "RigEstimate.of_content", "RigEstimate.set_extra_state", "ShapeFit.arrays", "Status.code",
     "Status.from_code", "Status.is_refined", "StereoCamera.num_frames", "box_formats.is_z_up",
     "config_files.load_config",

@@ -40,3 +40,15 @@ def test_a_wrong_depth_has_no_evidence(factor: float, dimensions: float) -> None
 
 def test_boxes_as_they_are_come_back_refined() -> None:
     assert refined(1.0, 1.0).refined.all()
+
+
+def test_boxes_and_masks_of_another_image_show_no_car() -> None:
+    """The images are moved along themselves, so that streets and walls lie under the masks of six cars."""
+    scene = load_scene()
+    refiner = DirectShapeRefiner(config=load_config("default")).to(scene.detections.T_cam_obj.dtype)
+    num_refined = 0
+    for shift_px in (150, 250, 330, 420, 520, 600):
+        images = {side: getattr(scene.frame, side).roll(shift_px, dims=3) for side in ("images_left", "images_right")}
+        result: RefinementResult = refiner(replace(scene.frame, **images), scene.detections)
+        num_refined += int(result.refined.sum())
+    assert num_refined <= 10, "of 36; without a look at where their pixels match best 18"

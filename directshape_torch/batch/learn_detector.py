@@ -1,0 +1,49 @@
+"""What a run's detector is off by, from refinements of some of its frames (`RigEstimate.learn`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+
+import torch
+
+from directshape_torch.config import AcceptanceConfig
+from directshape_torch.errors import DirectShapeError
+from directshape_torch.io.stereo_dataset import StereoDataset
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.rig.estimate import RigEstimates
+from directshape_torch.rig.from_files import evenly
+
+# Standard deviations of so many differences are known to 7 %.
+_ENOUGH_RESULTS = 100
+_MOST_FRAMES = 60
+_EVERY_RESULT = AcceptanceConfig(min_probability_better=0.0, min_probability_not_worse=0.0)
+
+
+def learn_detector(
+    dataset: StereoDataset,
+    refiner: DirectShapeRefiner,
+    rigs: RigEstimates,
+    tell: Callable[[str], object] = lambda _: None,
+) -> None:
+    """Refine frames until the rigs know what the detector is off by, and let them learn from every result.
+
+    Frames are taken evenly from all of the data set, whichever of them are chosen, at most 60. What cannot be read is
+    passed over: it is reported when its turn comes. `tell` gets the name of each frame.
+    """
+    config = replace(refiner.config, acceptance=_EVERY_RESULT, check="off")
+    alone = DirectShapeRefiner(refiner.prior, config, refiner.extra_terms, rigs)
+    like = refiner.prior.origin
+    names = evenly(list(dict.fromkeys([*dataset.layout.frame_ids(), *dataset.frame_ids])))
+    for frame_id in names[:_MOST_FRAMES]:
+        with suppress(DirectShapeError, OSError):
+            loaded = dataset.load(frame_id)
+            if not len(loaded.detections):
+                continue
+            frames, detections = loaded.frame.to(like.device, like.dtype), loaded.detections.to(like.device, like.dtype)
+            with torch.no_grad():
+                rigs.learn(frames, alone(frames, detections))
+            tell(frame_id)
+            if len(rigs.results) >= _ENOUGH_RESULTS:
+                break

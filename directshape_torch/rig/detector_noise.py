@@ -1,0 +1,60 @@
+"""What a detector is off by, from how far refined cars lie from its boxes beyond what the images are off by themselves.
+
+Empirical Bayes: each standard deviation is that of a Student-t distribution of the differences, whose variance has the
+images' added, averaged over a grid with a prior of what detectors have, from LiDAR to one camera.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+COLUMNS = 15
+"""Of a row: distance along the ground, metres; seven differences and seven standard deviations of the images, see
+`refinement.fusion.DetectorComparison`."""
+
+# Middle and spread (of the logarithm) of the standard deviations of detectors: of the depth as a share of the distance,
+# sideways, height, heading (times 2 m), length, width and height, metres.
+_MIDDLE = (0.02, 0.12, 0.06, 0.16, 0.35, 0.08, 0.08)
+_SPREAD = (1.2, 0.8, 0.6, 1.0, 0.5, 0.5, 0.5)
+_FACTORS = torch.linspace(-4, 3, 71, dtype=torch.float64).exp()
+_DEGREES_OF_FREEDOM = 4
+# Results keep something of their start, and the energy holds shapes to the detector's dimensions: so much of what a
+# detector is off by shows, over the labels of KITTI and of rendered frames (scripts/calibrate_fusion.py).
+_SHOWN = (0.77, 0.77, 0.77, 0.77, 0.5, 0.5, 0.5)
+
+
+def detector_sigmas(
+    rows: Tensor,  # (N, 15) float64
+) -> Tensor:  # (7,)
+    """Standard deviations of the detector in `CAR_QUANTITIES`: of the depth as a share of the distance, else metres.
+
+    Examples:
+        >>> noise = torch.randn(500, 7, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        >>> rows = torch.cat([torch.ones(500, 1), 0.3 * noise, torch.full((500, 7), 0.01)], dim=1)
+        >>> detector_sigmas(rows)[1:4]
+        tensor([0.25, 0.26, 0.27], dtype=torch.float64)
+    """
+    distance, difference, sigma = rows[:, 0], rows[:, 1:8], rows[:, 8:]
+    units = torch.ones_like(difference)
+    units[:, 0] = distance
+    middle, spread, shown = (torch.tensor(x, dtype=torch.float64) for x in (_MIDDLE, _SPREAD, _SHOWN))
+    noise = _FACTORS[:, None] * middle
+    variance = (noise[:, None] * units) ** 2 + sigma**2
+    nu = _DEGREES_OF_FREEDOM
+    log_likelihood = -0.5 * (variance.log() + (nu + 1) * torch.log1p(difference**2 / variance / nu)).sum(dim=1)
+    log_prior = -0.5 * ((noise / middle).log() / spread) ** 2
+    share = (log_likelihood + log_prior).softmax(dim=0)
+    return (share * noise.log()).sum(dim=0).exp() / shown
+
+
+def in_words(sigmas: Tensor) -> str:
+    """Standard deviations (7,) in one line."""
+    depth, sideways, up, heading, length, width, height = sigmas.tolist()
+    turn = math.degrees(heading / 2)
+    return (
+        f"depth {depth:.1%}, sideways {sideways:.2f} m, height above ground {up:.2f} m, heading {turn:.1f} deg, "
+        f"length {length:.2f} m, width {width:.2f} m, height {height:.2f} m"
+    ).replace("%", " %")
