@@ -44,7 +44,7 @@ class KnownRig(Protocol):
         """Detections with what is not known of their depths and of the rig, where they do not say it."""
         ...
 
-    def detector_sigmas(self, frames: FrameBatch) -> Tensor | None:
+    def detector_sigmas(self) -> Tensor | None:
         """Standard deviations (7,) of the detector, see `refinement.fusion.fused`; None where nothing is known."""
         ...
 
@@ -144,7 +144,7 @@ class DirectShapeRefiner(nn.Module):
             if self.rig is None or self.config.method != "direct":
                 return result
             weight = self.config.priors.detector_weight
-            sigmas = self.rig.detector_sigmas(frames) if weight else None
+            sigmas = self.rig.detector_sigmas() if weight else None
             return fused(result, detections, None if sigmas is None else sigmas / math.sqrt(weight))
 
     def _warn_of(self, frames: FrameBatch, detections: Detections) -> None:

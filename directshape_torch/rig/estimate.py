@@ -143,7 +143,7 @@ class RigEstimate(nn.Module):
             raise InputError("rows", "finite differences and standard deviations above 0", "others")
         self.results = torch.cat([self.results, rows.detach().to(self.results)])[-_MOST_ROWS:]
 
-    def detector_sigmas(self, frames: FrameBatch | None = None) -> Tensor | None:
+    def detector_sigmas(self) -> Tensor | None:
         """Standard deviations (7,) of the detector, see `refinement.fusion.fused`; None where no results are known."""
         return detector_noise.detector_sigmas(self.results) if len(self.results) else None
 
@@ -363,7 +363,7 @@ class RigEstimates(nn.ModuleList):
         known = [rig.results for rig in self if isinstance(rig, RigEstimate)]
         return torch.cat(known) if known else torch.zeros(0, detector_noise.COLUMNS, dtype=torch.float64)
 
-    def detector_sigmas(self, frames: FrameBatch | None = None) -> Tensor | None:
+    def detector_sigmas(self) -> Tensor | None:
         """See `RigEstimate`; by the results of all rigs."""
         results = self.results
         return detector_noise.detector_sigmas(results) if len(results) else None

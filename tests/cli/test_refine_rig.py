@@ -12,7 +12,7 @@ from test_refine_command import command
 
 from directshape_torch.cli.main import main
 from directshape_torch.io.result_files import read_shapes
-from directshape_torch.rig.rig_file import load_rigs, save_field
+from directshape_torch.rig.rig_file import load_rigs, save_field, save_rigs
 
 
 @pytest.fixture
@@ -70,9 +70,15 @@ def test_frames_of_two_rigs_are_refined_in_one_run(
     for name in ("data/000000.txt", "data/000001.txt"):
         by_rig, by_file, by_none = ((tmp_path / each / name).read_text() for each in ("out", "by_file", "none"))
         assert by_rig == by_file != by_none
+    # Another detector makes other results, and a run goes on with its own alone.
+    first, second = load_rigs(tmp_path / "out" / "rig.json")
+    first.add_results(first.results[:1])
+    save_rigs(tmp_path / "more.json", [first, second])
+    assert main(command(source, tmp_path / "by_file", "--rig", str(tmp_path / "more.json"))) == 2
+    assert "detector_sigmas" in capsys.readouterr().err
     field = load_rigs(tmp_path / "out" / "rig.json")[0].field
     save_field(replace(field, coefficients=field.coefficients + 0.5), tmp_path / "other.json")
-    assert main(command(source, tmp_path / "by_file", "--rig", str(tmp_path / "other.json"))) == 2
+    assert main(command(source, tmp_path / "none", "--rig", str(tmp_path / "other.json"))) == 2
     assert "sha256 of 'stereo_bias'" in capsys.readouterr().err
 
 
