@@ -102,7 +102,8 @@ class DirectShapeRefiner(nn.Module):
 
         With `config.backward.mode` other than "none" pose and code of the result carry gradients to the masks, the
         images, the prior's tensors, the term weights, the disparity that the frames bring and the detector's standard
-        deviations; to the input poses with "unroll", and in the other modes where there are such standard deviations.
+        deviations; to the input poses with "unroll", and in the other modes where there are such standard deviations,
+        or a rig that has learnt what the detector is off by.
 
         Args:
             frames: F frames; dtype and device must be those of the prior.
@@ -128,6 +129,8 @@ class DirectShapeRefiner(nn.Module):
     def _checked_refine(
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None
     ) -> RefinementResult:
+        # Standard deviations that are given are a prior of the energy, which the detector's box must not count beside.
+        is_given = getattr(detections, "pose_sigma", None) is not None or any(self.config.priors.pose_sigmas)
         frames, detections = self._with_rig(frames, detections)
         of_prior = (tensor for _, tensor in (*self.prior.named_buffers(), *self.prior.named_parameters()))
         check_no_tangents(frames, detections, (*(term_weights or {}).values(), *of_prior))
@@ -144,7 +147,7 @@ class DirectShapeRefiner(nn.Module):
             if self.rig is None or self.config.method != "direct":
                 return result
             weight = self.config.priors.detector_weight
-            sigmas = self.rig.detector_sigmas() if weight else None
+            sigmas = self.rig.detector_sigmas() if weight and not is_given else None
             return fused(result, detections, None if sigmas is None else sigmas / math.sqrt(weight))
 
     def _warn_of(self, frames: FrameBatch, detections: Detections) -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 import torch
 
-from directshape_torch.config import AcceptanceConfig
-from directshape_torch.errors import DirectShapeError
+from directshape_torch.config import AcceptanceConfig, PriorConfig
+from directshape_torch.errors import CompilationError, MissingDependencyError
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.estimate import RigEstimates
@@ -18,6 +18,7 @@ from directshape_torch.rig.from_files import evenly
 # Standard deviations of so many differences are known to 7 %.
 _ENOUGH_RESULTS = 100
 _MOST_FRAMES = 60
+_GIVEN_SIGMAS = [each.name for each in fields(PriorConfig) if each.name.startswith("pose_sigma_")]
 _EVERY_RESULT = AcceptanceConfig(min_probability_better=0.0, min_probability_not_worse=0.0)
 
 
@@ -32,18 +33,26 @@ def learn_detector(
     Frames are taken evenly from all of the data set, whichever of them are chosen, at most 60. What cannot be read is
     passed over: it is reported when its turn comes. `tell` gets the name of each frame.
     """
-    config = replace(refiner.config, acceptance=_EVERY_RESULT, check="off")
+    # What is given of the detector beforehand would hold results to its boxes and make it look better than it is.
+    nothing_given: dict[str, Any] = dict.fromkeys(_GIVEN_SIGMAS, 0.0)
+    priors = replace(refiner.config.priors, **nothing_given)
+    config = replace(refiner.config, acceptance=_EVERY_RESULT, check="off", priors=priors)
     alone = DirectShapeRefiner(refiner.prior, config, refiner.extra_terms, rigs)
     like = refiner.prior.origin
     names = evenly(list(dict.fromkeys([*dataset.layout.frame_ids(), *dataset.frame_ids])))
     for frame_id in names[:_MOST_FRAMES]:
-        with suppress(DirectShapeError, OSError):
+        try:
             loaded = dataset.load(frame_id)
             if not len(loaded.detections):
                 continue
             frames, detections = loaded.frame.to(like.device, like.dtype), loaded.detections.to(like.device, like.dtype)
             with torch.no_grad():
                 rigs.learn(frames, alone(frames, detections))
-            tell(frame_id)
-            if len(rigs.results) >= _ENOUGH_RESULTS:
-                break
+        except (CompilationError, MissingDependencyError):
+            raise
+        # Whatever a frame brings to light, too little memory too, is told when its turn comes.
+        except Exception:
+            continue
+        tell(frame_id)
+        if len(rigs.results) >= _ENOUGH_RESULTS:
+            break

@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
+from directshape_torch.batch.group_refinement import limited_threads
 from directshape_torch.batch.learn_detector import learn_detector
 from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.batch.refine_dataset import check_out_dir, refine_dataset
@@ -122,10 +123,12 @@ def run(args: argparse.Namespace) -> int:
         refiner.rig = RigEstimates(rigs)
         if refiner.config.method == "direct":
             _say_where_rigs_are_guesses(rigs)
-            _learn(dataset, refiner, refiner.rig)
+            with limited_threads(options.threads):
+                _learn(dataset, refiner, refiner.rig)
         for estimate in rigs if are_new else []:
             print(estimate)
-        if (sigmas := refiner.rig.detector_sigmas()) is not None:
+        sigmas = refiner.rig.detector_sigmas()
+        if sigmas is not None and refiner.config.method == "direct" and refiner.config.priors.detector_weight:
             print(f"detector: off by {in_words(sigmas)}, from {len(refiner.rig.results)} results")
     with _Progress(args.out, rigs if are_new else None) as progress:
         summary = refine_dataset(dataset, refiner, args.out, options, progress, fresh=args.fresh)

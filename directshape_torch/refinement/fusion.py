@@ -149,7 +149,7 @@ def _moved(
         at = _at(result, rows, state)
         done = difference - _difference(at, rows, detections).double()
         state = retract(state, images.step(target - done))
-    posterior = images.covariance - gain @ images.covariance
+    posterior = gain @ torch.diag_embed(sigmas**2)
     comparison = result.comparison.rows(rows)
     return replace(
         _at(result, rows, state),

@@ -312,8 +312,9 @@ class RefinementResult(CarRecord):
     def sigma_xyz_yaw(self) -> Tensor:
         """Calibrated standard deviations (B, 4) of the box's place in `ref` and of its heading, metres and radians.
 
-        NaN for cars that were not refined. Calibrated with the default settings: on rendered frames for boxes of the
-        images alone, on KITTI where they were brought together with the detector's. A rig's own disparity error is in
+        NaN for cars that were not refined. Calibrated with the default settings on rendered frames for boxes of the
+        images alone; where they were brought together with the detector's, scales of Student's t of 4 degrees of
+        freedom, fitted on KITTI. A rig's own disparity error is in
         them as far as the covariance of its field, `rig.disparity_sigma_px` or `Detections.offset_sigma_px` says.
         """
         location = self.T_cam_obj[:, :3, 3]

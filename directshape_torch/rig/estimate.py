@@ -107,11 +107,7 @@ class RigEstimate(nn.Module):
         largest = float(rows.detach().abs().amax()) if len(rows) else 0.0
         if not largest <= _LARGEST_PX:
             raise InputError("rows", f"finite pixels of at most {_LARGEST_PX:g}", f"{largest:g}")
-        # The same frame again says nothing new.
-        rows = torch.cat([self.rows, rows.detach().to(self.rows)]).unique(dim=0)  # type: ignore[no-untyped-call]
-        # The same rows are kept, in the same order, however they came.
-        key = (rows[:, :4] * rows.new_tensor([0.754877, 0.569840, 0.430159, 0.324718])).sum(dim=1) % 1
-        self.rows, self._solved = rows[key.argsort()[:_MOST_ROWS]], None
+        self.rows, self._solved = _kept_rows(torch.cat([self.rows, rows.detach().to(self.rows)])), None
 
     def add_pixels(self, kind: str, evidence: PixelEvidence) -> None:
         """Take in pixels of known depth: `kind` is "lidar", "disparity" or "motion"."""
@@ -141,7 +137,7 @@ class RigEstimate(nn.Module):
         check_shape("rows", rows, ("N", detector_noise.COLUMNS), kind="floating")
         if not bool(rows.isfinite().all()) or bool((rows[:, 8:] <= 0).any()):
             raise InputError("rows", "finite differences and standard deviations above 0", "others")
-        self.results = torch.cat([self.results, rows.detach().to(self.results)])[-_MOST_ROWS:]
+        self.results = _kept_rows(torch.cat([self.results, rows.detach().to(self.results)]))
 
     def detector_sigmas(self) -> Tensor | None:
         """Standard deviations (7,) of the detector, see `refinement.fusion.fused`; None where no results are known."""
@@ -393,6 +389,13 @@ def to_tensor(entry: Mapping[str, Any], name: str, shape: tuple[int | None, ...]
     if not fits or not bool(tensor.isfinite().all()):
         raise ValueError(f"{name!r} must be finite numbers of shape {shape}, got {tuple(tensor.shape)}")
     return tensor
+
+
+def _kept_rows(rows: Tensor) -> Tensor:
+    """At most 1000 of the rows, each once: the same ones, in the same order, however and how often they came."""
+    rows = rows.unique(dim=0)  # type: ignore[no-untyped-call]
+    key = (rows[:, :4] * rows.new_tensor([0.754877, 0.569840, 0.430159, 0.324718])).sum(dim=1) % 1
+    return rows[key.argsort()[:_MOST_ROWS]]
 
 
 def _plain(value: int | Tensor) -> Any:

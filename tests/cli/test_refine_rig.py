@@ -72,7 +72,7 @@ def test_frames_of_two_rigs_are_refined_in_one_run(
         assert by_rig == by_file != by_none
     # Another detector makes other results, and a run goes on with its own alone.
     first, second = load_rigs(tmp_path / "out" / "rig.json")
-    first.add_results(first.results[:1])
+    first.add_results(first.results[:1] + 0.01)
     save_rigs(tmp_path / "more.json", [first, second])
     assert main(command(source, tmp_path / "by_file", "--rig", str(tmp_path / "more.json"))) == 2
     assert "detector_sigmas" in capsys.readouterr().err

@@ -107,6 +107,9 @@ def test_a_refiner_whose_rig_has_learnt_returns_what_both_say() -> None:
     together = refiner(scene.frames, detections)
     torch.testing.assert_close(together.T_cam_obj, fused(images, detections, sigmas).T_cam_obj)
     assert not together.T_cam_obj.equal(images.T_cam_obj)
+    # Standard deviations that are given are a prior of the energy, and count once.
+    given = replace(detections, pose_sigma=torch.full((len(detections), 4), 1e6).to(detections.T_cam_obj))
+    assert refiner(scene.frames, given).comparison.covariance.isnan().all()
     alone = replace(DEFAULT, priors=replace(DEFAULT.priors, detector_weight=0.0))
     assert DirectShapeRefiner(prior, alone, rig=rig)(scene.frames, detections).T_cam_obj.equal(images.T_cam_obj)
 
