@@ -34,8 +34,8 @@ def detector_sigmas(
     Examples:
         >>> noise = torch.randn(500, 7, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         >>> rows = torch.cat([torch.ones(500, 1), 0.3 * noise, torch.full((500, 7), 0.01)], dim=1)
-        >>> detector_sigmas(rows)[1:4]
-        tensor([0.25, 0.26, 0.27], dtype=torch.float64)
+        >>> [round(float(sigma), 1) for sigma in detector_sigmas(rows)[1:4]]
+        [0.3, 0.3, 0.3]
     """
     distance, difference, sigma = rows[:, 0], rows[:, 1:8], rows[:, 8:]
     units = torch.ones_like(difference)
