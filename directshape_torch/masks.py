@@ -153,7 +153,6 @@ class MaskCrops(TensorRecord):
 
     def __getitem__(self, row: int) -> Tensor:
         """One mask (H, W), zero where there is none."""
-        row = range(len(self))[row]
         u0, v0, u1, v1 = self._boxes[row]
         height, width = self.size_hw
         return torch.nn.functional.pad(self.crop(row), (u0, width - u1, v0, height - v1))

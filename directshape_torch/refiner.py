@@ -129,8 +129,9 @@ class DirectShapeRefiner(nn.Module):
     def _checked_refine(
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None
     ) -> RefinementResult:
-        # Standard deviations that are given are a prior of the energy, which the detector's box must not count beside.
-        is_given = getattr(detections, "pose_sigma", None) is not None or any(self.config.priors.pose_sigmas)
+        detections = in_dtype_of(frames, detections)
+        # Standard deviations that are given are a prior of the energy, beside which the box must not count again.
+        sigmas = self.detector_sigmas if detections.pose_sigma is None else None
         frames, detections = self._with_rig(frames, detections)
         of_prior = (tensor for _, tensor in (*self.prior.named_buffers(), *self.prior.named_parameters()))
         check_no_tangents(frames, detections, (*(term_weights or {}).values(), *of_prior))
@@ -143,12 +144,23 @@ class DirectShapeRefiner(nn.Module):
             compiling(self.config.compile, len(detections)),
         ):
             result = self._refine(frames, detections, term_weights)
-            # What the images are off by was measured with their own method.
-            if self.rig is None or self.config.method != "direct":
-                return result
-            weight = self.config.priors.detector_weight
-            sigmas = self.rig.detector_sigmas() if weight and not is_given else None
-            return fused(result, detections, None if sigmas is None else sigmas / math.sqrt(weight))
+            return result if self.rig is None else fused(result, detections, sigmas)
+
+    @property
+    def weighs_detector(self) -> bool:
+        """Whether results are brought together with the detector's boxes once a rig knows what these are off by.
+
+        What the images are off by was measured with the method "direct", and standard deviations that the settings give
+        are a prior of the energy.
+        """
+        priors = self.config.priors
+        return self.config.method == "direct" and priors.detector_weight > 0 and not any(priors.pose_sigmas)
+
+    @property
+    def detector_sigmas(self) -> Tensor | None:
+        """Standard deviations (7,) by which the detector's boxes count, see `refinement.fusion.fused`, or None."""
+        known = self.rig.detector_sigmas() if self.rig is not None and self.weighs_detector else None
+        return None if known is None else known / math.sqrt(self.config.priors.detector_weight)
 
     def _warn_of(self, frames: FrameBatch, detections: Detections) -> None:
         """Mistakes that the tensors of this call show, as the setting `check` asks."""
@@ -200,7 +212,7 @@ class DirectShapeRefiner(nn.Module):
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None = None
     ) -> tuple[CarProblem, CarState]:
         """The minimisation problem and the input state of these cars, for experiments; statuses are not checked."""
-        frames, detections = self._with_rig(frames, detections)
+        frames, detections = self._with_rig(frames, in_dtype_of(frames, detections))
         cars = self._cars(frames, detections)
         seen = self._observe(frames, detections)
         problem = problem_of_scene(
@@ -210,7 +222,6 @@ class DirectShapeRefiner(nn.Module):
 
     def _with_rig(self, frames: FrameBatch, detections: Detections) -> tuple[FrameBatch, Detections]:
         """The call's inputs, checked, with what is known of the rig and the detector."""
-        detections = in_dtype_of(frames, detections)
         frames = frames if self.rig is None else self.rig.corrected(frames)
         check_fit(frames, detections, self.prior)
         if self.rig is None:

@@ -39,9 +39,9 @@ from directshape_torch.refinement.fusion import IMAGE_NOISE, ImageNoise, fused
 from directshape_torch.refinement.observability import CAR_QUANTITIES
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.rig.detector_noise import detector_sigmas
-from directshape_torch.rig.estimate import RigEstimates
+from directshape_torch.rig.detector_noise import detector_sigmas, rows_of
 from directshape_torch.rig.from_files import estimate_rigs
+from directshape_torch.rig.rigs import RigEstimates
 from directshape_torch.scene import Detections
 
 WORSE_BY = 0.05
@@ -62,7 +62,7 @@ class Frame(NamedTuple):
 
 @dataclass(frozen=True)
 class Cars:
-    """Those of one data set and detector."""
+    """The refined cars of one data set from the boxes of one detector."""
 
     root: Path
     name: str
@@ -71,16 +71,12 @@ class Cars:
 
     def comparisons(self, noise: ImageNoise, with_truth: bool = False) -> Tensor:
         """Rows (N, 15) of `rig.detector_noise`, of the detector or of the labels."""
-        rows = []
-        for frame in self.frames:
-            boxes = frame.truth if with_truth else frame.detections
-            found = fused(frame.result, boxes, None, noise).comparison
-            distance = torch.hypot(frame.result.T_cam_obj[:, 0, 3], frame.result.T_cam_obj[:, 2, 3]).double()
-            rows.append(torch.cat([distance[:, None], found.difference, found.sigma_images], dim=1))
-        return torch.cat(rows)
+        boxes = [frame.truth if with_truth else frame.detections for frame in self.frames]
+        pairs = zip(self.frames, boxes, strict=True)
+        return torch.cat([rows_of(fused(frame.result, each, None, noise).comparison) for frame, each in pairs])
 
     def overlaps(self, noise: ImageNoise | None) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Of the input and of the images' boxes, or of what both say together by some noise of the images."""
+        """Overlaps with the labels of the input, and of the boxes that some noise of the images gives; None: theirs."""
         sigmas = None if noise is None else detector_sigmas(self.comparisons(noise))
         before, after = [], []
         for frame in self.frames:

@@ -44,8 +44,8 @@ from directshape_torch.io.config_files import load_config
 from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.refinement.quality import TrustModel
 from directshape_torch.refiner import DirectShapeRefiner, KnownRig
-from directshape_torch.rig.estimate import RigEstimates
 from directshape_torch.rig.from_files import estimate_rigs
+from directshape_torch.rig.rigs import RigEstimates
 
 EVERYTHING = AcceptanceConfig(min_probability_better=0.0, min_probability_not_worse=0.0)
 # The detectors whose share of worse cars the default policy is to bring below the bound: those of the development data.

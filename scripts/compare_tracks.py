@@ -40,8 +40,8 @@ from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.rig.estimate import RigEstimates
 from directshape_torch.rig.rig_file import load_rigs
+from directshape_torch.rig.rigs import RigEstimates
 from directshape_torch.shape.load_prior import load_prior
 
 _WORSE = 0.05

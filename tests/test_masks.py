@@ -222,7 +222,7 @@ INSIDE = np.linspace(0.1, 1.0, 6, dtype=np.float32).reshape(2, 3)
     ],
 )
 def test_masks_known_in_boxes_alone(box: Any, pixels: Any, expected: Any) -> None:
-    """The same forms of masks are taken as of whole images."""
+    """Masks of boxes may have every form that masks of whole images may have."""
     crops = MaskCrops.of_boxes([(box, pixels)], (4, 6), torch.zeros(1))
     np.testing.assert_allclose(crops.crop(0).numpy(), expected, atol=1e-3)
 

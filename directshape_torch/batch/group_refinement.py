@@ -25,7 +25,7 @@ from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 
 # What is true of every frame: going on would only fail them one after another.
-_STOPS_THE_RUN = (CompilationError, MissingDependencyError, OutputLostError)
+STOPS_THE_RUN = (CompilationError, MissingDependencyError, OutputLostError)
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def refine_group(job: RunJob, group: FrameGroup) -> GroupReport:
     step, cpu_start_s = _GroupStep(job, group), time.process_time()
     try:
         step.refine(group.frame_ids)
-    except _STOPS_THE_RUN as error:
+    except STOPS_THE_RUN as error:
         step.report.stopped = _reason(error)
     timings = step.report.timings
     timings.cpu_s = time.process_time() - cpu_start_s
@@ -101,7 +101,7 @@ class _GroupStep:
             batch = [ready for ready in map(self._read, frame_ids) if ready is not None]
             parts = [[batch[k] for k in part] for part in split_by_rig([loaded for loaded, _ in batch])]
             results = [self._call([loaded for loaded, _ in part]) for part in parts]
-        except _STOPS_THE_RUN:
+        except STOPS_THE_RUN:
             raise
         # Whatever a frame of a hundred thousand brings to light: it is reported, and the others go on.
         except Exception as error:
@@ -119,7 +119,7 @@ class _GroupStep:
         try:
             inputs = hash_files(self.job.dataset.input_files(frame_id))
             return self.job.dataset.load(frame_id), inputs
-        except _STOPS_THE_RUN:
+        except STOPS_THE_RUN:
             raise
         except (DirectShapeError, OSError) as error:
             self._fail(frame_id, _reason(error))
@@ -140,7 +140,7 @@ class _GroupStep:
             with writing_to(job.out_dir):
                 entry = write_frame_outputs(job.out_dir, loaded, result, job.run, job.prior_sha256, inputs, job.options)
             self.report.ends[loaded.frame_id] = entry
-        except _STOPS_THE_RUN:
+        except STOPS_THE_RUN:
             raise
         except (DirectShapeError, OSError) as error:
             self._fail(loaded.frame_id, _reason(error))

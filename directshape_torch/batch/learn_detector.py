@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
-from typing import Any
+from dataclasses import replace
 
 import torch
 
-from directshape_torch.config import AcceptanceConfig, PriorConfig
-from directshape_torch.errors import CompilationError, MissingDependencyError
+from directshape_torch.batch.group_refinement import STOPS_THE_RUN
+from directshape_torch.config import AcceptanceConfig
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.rig.estimate import RigEstimates
 from directshape_torch.rig.from_files import evenly
+from directshape_torch.rig.rigs import RigEstimates
 
 # Standard deviations of so many differences are known to 7 %.
 _ENOUGH_RESULTS = 100
 _MOST_FRAMES = 60
-_GIVEN_SIGMAS = [each.name for each in fields(PriorConfig) if each.name.startswith("pose_sigma_")]
 _EVERY_RESULT = AcceptanceConfig(min_probability_better=0.0, min_probability_not_worse=0.0)
 
 
@@ -33,10 +31,7 @@ def learn_detector(
     Frames are taken evenly from all of the data set, whichever of them are chosen, at most 60. What cannot be read is
     passed over: it is reported when its turn comes. `tell` gets the name of each frame.
     """
-    # What is given of the detector beforehand would hold results to its boxes and make it look better than it is.
-    nothing_given: dict[str, Any] = dict.fromkeys(_GIVEN_SIGMAS, 0.0)
-    priors = replace(refiner.config.priors, **nothing_given)
-    config = replace(refiner.config, acceptance=_EVERY_RESULT, check="off", priors=priors)
+    config = replace(refiner.config, acceptance=_EVERY_RESULT, check="off")
     alone = DirectShapeRefiner(refiner.prior, config, refiner.extra_terms, rigs)
     like = refiner.prior.origin
     names = evenly(list(dict.fromkeys([*dataset.layout.frame_ids(), *dataset.frame_ids])))
@@ -48,7 +43,7 @@ def learn_detector(
             frames, detections = loaded.frame.to(like.device, like.dtype), loaded.detections.to(like.device, like.dtype)
             with torch.no_grad():
                 rigs.learn(frames, alone(frames, detections))
-        except (CompilationError, MissingDependencyError):
+        except STOPS_THE_RUN:
             raise
         # Whatever a frame brings to light, too little memory too, is told when its turn comes.
         except Exception:

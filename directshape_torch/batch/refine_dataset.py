@@ -228,8 +228,7 @@ def run_manifest(dataset: StereoDataset, refiner: DirectShapeRefiner, batch_fram
     }
     if has_tracks(dataset):
         settings["track_frames"] = batch_frames
-    sigmas = None if refiner.rig is None else refiner.rig.detector_sigmas()
-    if sigmas is not None:
+    if (sigmas := refiner.detector_sigmas) is not None:
         settings["detector_sigmas"] = sigmas.tolist()
     if refiner.extra_terms:
         settings["extra_terms"] = [_described(make) for make in refiner.extra_terms]

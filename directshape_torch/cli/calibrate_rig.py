@@ -19,7 +19,7 @@ from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import check_file, write_png
 from directshape_torch.io.frame_layout import frames_among
 from directshape_torch.io.layouts import object_layout
-from directshape_torch.rig.estimate import RigEstimate, rig_among
+from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.from_files import (
     TruthSource,
     add_truth,
@@ -31,6 +31,7 @@ from directshape_torch.rig.from_files import (
     truth_files,
 )
 from directshape_torch.rig.rig_file import load_rigs, save_rigs
+from directshape_torch.rig.rigs import rig_among
 from directshape_torch.rig.self_calibration import self_calibrate
 from directshape_torch.visualize.rig_picture import draw_rigs
 

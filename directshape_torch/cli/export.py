@@ -18,8 +18,8 @@ from directshape_torch.export.export_run import FORMATS, export_run
 from directshape_torch.export.frame_source import ExportOptions
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.rig.estimate import RigEstimates
 from directshape_torch.rig.rig_file import known_rigs
+from directshape_torch.rig.rigs import RigEstimates
 from directshape_torch.visualize.run_frames import RunInputs
 
 

@@ -25,8 +25,8 @@ from directshape_torch.io.kitti_labels import box_corners_cam
 from directshape_torch.io.result_files import track_name
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.rig.estimate import RigEstimates
 from directshape_torch.rig.rig_file import known_rigs
+from directshape_torch.rig.rigs import RigEstimates
 from directshape_torch.visualize.car_figures import (
     CarCourse,
     drift_figure,

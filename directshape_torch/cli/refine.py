@@ -35,9 +35,10 @@ from directshape_torch.files.atomic_files import write_png
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.detector_noise import in_words
-from directshape_torch.rig.estimate import RigEstimate, RigEstimates
+from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.from_files import estimate_rigs
 from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, known_rigs, load_rigs, save_rigs
+from directshape_torch.rig.rigs import RigEstimates
 from directshape_torch.scene_check.finding import SAID_BY_THE_RUN, by_severity
 from directshape_torch.terms.lidar import LidarPoints
 from directshape_torch.visualize.rig_picture import draw_rigs
@@ -123,13 +124,9 @@ def run(args: argparse.Namespace) -> int:
         refiner.rig = RigEstimates(rigs)
         if refiner.config.method == "direct":
             _say_where_rigs_are_guesses(rigs)
+        if refiner.weighs_detector:
             with limited_threads(options.threads):
                 _learn(dataset, refiner, refiner.rig)
-        for estimate in rigs if are_new else []:
-            print(estimate)
-        sigmas = refiner.rig.detector_sigmas()
-        if sigmas is not None and refiner.config.method == "direct" and refiner.config.priors.detector_weight:
-            print(f"detector: off by {in_words(sigmas)}, from {len(refiner.rig.results)} results")
     with _Progress(args.out, rigs if are_new else None) as progress:
         summary = refine_dataset(dataset, refiner, args.out, options, progress, fresh=args.fresh)
     for warning in summary.warnings:
@@ -172,14 +169,18 @@ def _rigs_of_run(dataset: StereoDataset, rig: str, out_dir: Path, fresh: bool) -
         return kept, False
     with Bar(desc="rig", unit="frame") as bar:
         rigs = estimate_rigs(dataset, lambda _: bar.update())
+    for estimate in rigs:
+        print(estimate)
     return rigs, True
 
 
 def _learn(dataset: StereoDataset, refiner: DirectShapeRefiner, rigs: RigEstimates) -> None:
-    """Let the rigs learn what the detector is off by, where they do not know it."""
-    if refiner.config.priors.detector_weight and rigs.detector_sigmas() is None:
+    """Let the rigs learn what the detector is off by where they do not know it, and print it."""
+    if rigs.detector_sigmas() is None:
         with Bar(desc="detector", unit="frame") as bar:
             learn_detector(dataset, refiner, rigs, lambda _: bar.update())
+    if (sigmas := rigs.detector_sigmas()) is not None:
+        print(f"detector: off by {in_words(sigmas)}, from {len(rigs.results)} results")
 
 
 def _say_where_rigs_are_guesses(rigs: Sequence[RigEstimate]) -> None:

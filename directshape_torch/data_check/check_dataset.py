@@ -11,8 +11,9 @@ from typing import Any
 from directshape_torch.data_check.check_frame import check_frame
 from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
 from directshape_torch.io.stereo_dataset import StereoDataset
-from directshape_torch.rig.estimate import RigEstimate, rig_among
+from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.rig import Rig
+from directshape_torch.rig.rigs import rig_among
 from directshape_torch.scene_check.car_evidence import FrameEvidence
 from directshape_torch.scene_check.check_scene import check_cars
 from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, found

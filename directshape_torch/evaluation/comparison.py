@@ -164,21 +164,18 @@ def _summarised(name: str, cars: Sequence[ComparedCar], num_draws: int, seed: in
 
 
 def _frames_of(before: Path, after: Path) -> tuple[str, ...]:
-    """Of the files of `before`; of the file or folder of a sequence, and of a single file, those that `after` has."""
+    """The frames to compare: every file of `before`, but those that `after` has of a file or folder of a sequence."""
     results = files_of_frames(after)
     if before.is_file():
         return tuple(results)
     of_sequence: dict[str, list[str]] = {}
     for stem in results:
         of_sequence.setdefault(stem.rpartition("_")[0], []).append(stem)
-    names = {
-        *files_of_frames(before),
-        *(path.name for path in before.iterdir() if path.is_dir() and path.name[0] != "."),
-    }
-    # What has neither a digit in its name nor results, README.txt, is no frame.
-    names = {name for name in names if name in of_sequence or name in results or any(map(str.isdigit, name))}
-    folders = {name for name in names if (before / name).is_dir() and name not in of_sequence}
-    return tuple(frame for name in sorted(names - folders) for frame in of_sequence.get(name, [name]))
+    files, folders = set(files_of_frames(before)), {path.name for path in before.iterdir() if path.is_dir()}
+    sequences = of_sequence.keys() & (files | folders)
+    # A file whose name has neither a digit nor results, README.txt, is no frame.
+    alone = {name for name in files - sequences if name in results or any(map(str.isdigit, name))}
+    return tuple(frame for name in sorted(sequences | alone) for frame in of_sequence.get(name, [name]))
 
 
 def _cars_of_frame(sources: tuple[Path, Path, Path], frame_id: str) -> tuple[list[ComparedCar], int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.kitti_rules import DIFFICULTIES, Curve, Difficulty, Floats, KittiScene, Metric
 from directshape_torch.evaluation.matching import chosen_frames, files_of_frames
+from directshape_torch.files.find_files import composed
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 
 MINIMUM_IOUS = (0.7, 0.5)
@@ -158,8 +158,8 @@ def _percent(samples: Floats) -> float:
 def _files(folder: Path | str, name: str) -> dict[str, Path]:
     if not Path(folder).is_dir():
         raise DataFormatError(folder, f"is no folder of {name}", cure="give the folder that holds the files NNNNNN.txt")
-    # However each of the two folders writes accents.
-    return {unicodedata.normalize("NFC", name): path for name, path in files_of_frames(Path(folder)).items()}
+    # The two folders may write accents differently.
+    return {composed(name): path for name, path in files_of_frames(Path(folder)).items()}
 
 
 def _results(path: Path) -> list[KittiObject]:

@@ -117,7 +117,7 @@ def chosen_frames(
         DataFormatError: the file cannot be read.
     """
     if split is not None:
-        known = frames_of_split(split, known, sequence=None)
+        known = frames_of_split(split, known)
     chosen = list(known) if frames is None else frames_among(known, frames, expected)
     if not chosen:
         raise InputError("frames", f"at least one of the {expected}", "none", "check the choice of frames")

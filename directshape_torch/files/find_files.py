@@ -32,9 +32,14 @@ def found(path: Path) -> Path | None:
     return None if name is None or not (path.parent / name).is_file() else path.parent / name
 
 
+def composed(name: str) -> str:
+    """The spelling of a name in which letters and their accents are one."""
+    return unicodedata.normalize("NFC", name)
+
+
 def is_called(path: Path, names: Iterable[str]) -> bool:
     """Whether a file has one of some names, without its ending and however accents are written."""
-    return unicodedata.normalize("NFC", path.stem) in {unicodedata.normalize("NFC", name) for name in names}
+    return composed(path.stem) in set(map(composed, names))
 
 
 def visible_files(folder: Path, endings: Iterable[str]) -> list[Path]:
@@ -74,5 +79,5 @@ def _listed(folder: Path) -> dict[str, str]:
 
 def _key(name: str) -> str:
     """A name as all spellings of it are: letters composed, the ending in small ones."""
-    stem, ending = os.path.splitext(unicodedata.normalize("NFC", name))
+    stem, ending = os.path.splitext(composed(name))
     return stem + ending.lower()

@@ -31,7 +31,7 @@ _MOST_TEXT_BYTES = 2**24
 # Parsed JSON takes some twenty times its size.
 _MOST_JSON_BYTES = 2**28
 _MOST_DIGITS = 18
-# Those of UTF-32 come first, for they begin as those of UTF-16 do.
+# The marks of UTF-32 are looked for first, for one of them begins with a mark of UTF-16.
 _MARKS = {
     **dict.fromkeys((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE), "utf-32"),
     **dict.fromkeys((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE), "utf-16"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.files.find_files import found, is_called, visible_files
+from directshape_torch.files.find_files import composed, found, is_called, visible_files
 from directshape_torch.files.read_files import is_frame_id, read_lines
 from directshape_torch.io import folder_files
 from directshape_torch.io.image_files import IMAGE_ENDINGS
@@ -150,7 +149,7 @@ def frames_among(known: Sequence[str], wanted: Iterable[str | int], expected: st
 
 
 def frames_of_split(
-    path: Path | str, known: Sequence[str], exists: Callable[[str], bool] = lambda _: False, sequence: str | None = ""
+    path: Path | str, known: Sequence[str], exists: Callable[[str], bool] = lambda _: False, sequence: str = ""
 ) -> list[str]:
     """The frames that the lines of a file name, each once.
 
@@ -161,8 +160,7 @@ def frames_of_split(
         path: the file.
         known: frames with detections.
         exists: whether there is a frame of a name; one without detections is reported when its turn comes.
-        sequence: whose frames have numbers alone: of lines of several words the first one must name it, and the second
-            one names the frame. "" where frames belong to no sequence or say to which; None: any first word will do.
+        sequence: the one that the frames are of, whose name the first of two words must be; "" where it is not known.
 
     Raises:
         DataFormatError: a line names no frame.
@@ -185,9 +183,12 @@ def frames_of_split(
 
 def _frame_word(folder: str, other: str, sequence: str | None, found: Mapping[str, str]) -> str:
     """Which of the first two words of a line names a frame of the sequence, or "" where they are of another one."""
-    if sequence == "" or not {_key(other), _key(_without_ending(other))} & found.keys():
+    is_frame, other_is_frame = (
+        bool({_key(word), _key(_without_ending(word))} & found.keys()) for word in (folder, other)
+    )
+    if not other_is_frame or (is_frame and not sequence):
         return folder
-    return other if sequence in (None, folder) else ""
+    return other if sequence in ("", folder) else ""
 
 
 def _by_name(known: Sequence[str]) -> dict[str, str]:
@@ -203,8 +204,8 @@ def _without_ending(word: str) -> str:
 
 
 def _key(word: str) -> str:
-    """A number without leading zeros; of other names the spelling in which letters and accents are one."""
-    return word.lstrip("0") or "0" if word.isdecimal() else unicodedata.normalize("NFC", word)
+    """A number without leading zeros; another name in one spelling."""
+    return word.lstrip("0") or "0" if word.isdecimal() else composed(word)
 
 
 def existing_folder(path: Path, problem: str, cure: str = "check the path") -> Path:

@@ -111,10 +111,10 @@ def _no_autocast() -> Iterator[None]:
 def full_precision() -> Iterator[None]:
     """No autocast, and no products of float32 with fewer digits, whatever the user has allowed.
 
-    Autocast is switched off on CPU, CUDA, XPU and MPS.
     Half precision cannot hold pixel coordinates, and TF32, which `torch.set_float32_matmul_precision("high")` allows
-    on a graphics card, rounds a coordinate of 30 m to 2 cm. The user's setting is put back at the end. Other than
-    autocast it belongs to the process: in the meantime the products of its other threads are exact, too.
+    on a graphics card, rounds a coordinate of 30 m to 2 cm. Autocast is switched off on CPU, CUDA, XPU and MPS. The
+    user's setting of TF32 is put back at the end. Other than autocast it belongs to the process: in the meantime the
+    products of its other threads are exact, too.
     """
     was_inside = _thread.is_inside
     _regions.enter()

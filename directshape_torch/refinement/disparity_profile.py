@@ -23,7 +23,7 @@ from directshape_torch.terms.photometric import Photometric, Surface, photometri
 from directshape_torch.terms.photometric_rows import PhotometricRows, residuals_at
 
 # Two minima nearer than this are one with a dent.
-_APART_PX = 0.75
+APART_PX = 0.75
 # A second minimum less than this factor above the first could be the true one.
 AMBIGUOUS_BELOW = 1.25
 MAX_PIXELS = 100
@@ -153,7 +153,7 @@ def _other_minimum(offsets_px: Tensor, cost: Tensor, best: Tensor) -> Tensor:
     """Lowest local minimum (B,) that is not the lowest one; one at an end counts, infinite where there is none."""
     padded = torch.nn.functional.pad(cost, (1, 1), value=torch.inf)
     is_minimum = (cost <= padded[:, :-2]) & (cost <= padded[:, 2:])
-    is_apart = (offsets_px - offsets_px[best][:, None]).abs() > _APART_PX - 1e-6
+    is_apart = (offsets_px - offsets_px[best][:, None]).abs() > APART_PX - 1e-6
     return torch.where(is_minimum & is_apart, cost, torch.inf).amin(dim=1)
 
 

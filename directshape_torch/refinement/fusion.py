@@ -32,11 +32,9 @@ class ImageNoise(NamedTuple):
     floors_m: tuple[float, ...]  # 7
 
 
-IMAGE_NOISE = ImageNoise((0.5, 0.5, 0.1, 2.1, 1.2, 0.5, 0.0), (0.108, 0.076, 0.06, 0.052, 0.19, 0.067, 0.053))
-"""Against labels of KITTI (scripts/calibrate_fusion.py)."""
+IMAGE_NOISE = ImageNoise((0.47, 0.0, 0.18, 2.16, 1.17, 0.34, 0.10), (0.136, 0.076, 0.060, 0.042, 0.219, 0.076, 0.053))
+"""Fitted to labels of KITTI: the row "without rendered" of scripts/calibrate_fusion.py."""
 
-# A first step is linear, and sizes are not; the second takes what is left.
-_NUM_STEPS = 2
 _RIDGE = 1e-9
 
 
@@ -44,12 +42,16 @@ _RIDGE = 1e-9
 class DetectorComparison(CarRecord):
     """Where B refined cars have their box and where the detector had it, columns `CAR_QUANTITIES`, metres.
 
+    There are NaN for cars that were not refined, and for those that share their shape with other views of a track.
+
     Attributes:
+        distance: (B,) of the images' box along the ground, metres.
         difference: (B, 7) the detector's less the images'; headings modulo half a turn.
         sigma_images: (B, 7) standard deviations of what the images say.
         covariance: (B, 7, 7) of the returned box where both were brought together, else NaN.
     """
 
+    distance: Annotated[Tensor, Dense("B")]
     difference: Annotated[Tensor, Dense("B", 7)]
     sigma_images: Annotated[Tensor, Dense("B", 7)]
     covariance: Annotated[Tensor, Dense("B", 7, 7)]
@@ -58,7 +60,7 @@ class DetectorComparison(CarRecord):
         self,
         location: Tensor,  # (B, 3) of the cars, for their viewing rays
     ) -> Tensor:  # (B, 4)
-        """Of x, y, z and the heading, squared metres and radians, of boxes that were brought together; else NaN."""
+        """The variances of x, y, z (metres) and heading (radians) of boxes that were brought together, else NaN."""
         # The quantities are depth and sideways position along the ground, and the height, which grows against y.
         axes = viewing_axes(location.detach().to(self.covariance))
         position = (axes.mT @ self.covariance[:, :3, :3] @ axes).diagonal(dim1=1, dim2=2)
@@ -77,84 +79,59 @@ def fused(
         result: of the images, B cars.
         detections: of the same cars.
         detector_sigmas: (7,) standard deviations of the detector in `CAR_QUANTITIES`: of the depth as a share of the
-            distance, the others in metres. None: nothing is known, and the images' boxes stay. So do those of cars that
-            share their shape with other views of a track.
+            distance, the others in metres. None: nothing is known, and the images' boxes stay.
         image_noise: what the images are off by.
     """
-    known = result.refined & result.covariance.isfinite().flatten(1).all(dim=1)
+    known = result.refined & result.covariance.isfinite().flatten(1).all(dim=1) & (result.track_part < 0)
     rows = known.nonzero()[:, 0]
     if not result.has_shape or not len(rows):
         return result
-    images = _Images.of(result, rows, image_noise)
     with torch.no_grad():
-        difference = _difference(result, rows, detections)
-    comparison = DetectorComparison(
-        difference.double(),
-        images.covariance.diagonal(dim1=1, dim2=2).sqrt(),
-        torch.full_like(images.covariance, torch.nan),
-    )
-    result = replace(result, comparison=result.comparison.put(rows, comparison))
-    if detector_sigmas is None:
-        return result
-    alone = (result.track_part[rows] < 0).nonzero()[:, 0]
-    return _moved(result, rows[alone], detections, images.rows(alone), detector_sigmas) if len(alone) else result
-
-
-@dataclass(frozen=True)
-class _Images(CarRecord):
-    """What the images say of R cars."""
-
-    J: Annotated[Tensor, Dense("R", 7, "D")]  # of the quantities by the tangent of `retract`
-    covariance: Annotated[Tensor, Dense("R", 7, 7)]  # of the quantities, metres
-
-    @classmethod
-    def of(cls, result: RefinementResult, rows: Tensor, noise: ImageNoise) -> _Images:
-        with torch.no_grad():
-            J = quantities_jacobian(result.prior, _state(result, rows))
-            factors, floors = (constant_like(x, J) for x in noise)
-            uncalibrated = J @ result.covariance[rows] @ J.mT
-        return cls(J, factors[:, None] * uncalibrated * factors + torch.diag(floors**2))
-
-    def step(self, change: Tensor) -> Tensor:
-        """The least step (R, D) of the tangent that changes the quantities by so much (R, 7).
-
-        The pose changes place and heading; the shape, whose unit is its own standard deviation, changes the sizes.
-        """
-        of_pose, of_code = _least(self.J[:, :4, :6], change[:, :4]), _least(self.J[:, 4:, 6:], change[:, 4:])
-        return torch.cat([of_pose, of_code], dim=1)
-
-
-def _least(J: Tensor, change: Tensor) -> Tensor:
-    """The smallest step (R, D) with `J step = change`."""
-    products = J @ J.mT
-    ridge = _RIDGE * torch.eye(J.shape[1], dtype=J.dtype, device=J.device)
-    step: Tensor = (J.mT @ torch.linalg.solve_ex(products + ridge, change[..., None])[0])[..., 0]
-    return step
+        J = quantities_jacobian(result.prior, _state(result, rows))
+        factors, floors = (constant_like(x, J) for x in image_noise)
+        of_images = factors[:, None] * (J @ result.covariance[rows] @ J.mT) * factors + torch.diag(floors**2)
+    difference, origin = _difference(result, rows, detections), result.T_cam_obj.detach()[rows, :3, 3].to(J)
+    distance, unknown = torch.hypot(origin[:, 0], origin[:, 2]), torch.full_like(of_images, torch.nan)
+    sigma_images = of_images.diagonal(dim1=1, dim2=2).sqrt()
+    comparison = DetectorComparison(distance, difference.detach(), sigma_images, unknown)
+    if detector_sigmas is not None:
+        sigmas = detector_sigmas.to(origin).repeat(len(rows), 1)
+        # The depth's is a share of where the detector has the car.
+        at_detector = detections.T_cam_obj.detach()[rows, :3, 3].to(origin)
+        sigmas[:, 0] = sigmas[:, 0] * torch.hypot(at_detector[:, 0], at_detector[:, 2])
+        of_detector = torch.diag_embed(sigmas**2)
+        # Both are symmetric, so that the gain is the transpose of what solves for the covariance.
+        gain = torch.linalg.solve_ex(of_images + of_detector, of_images)[0].mT
+        comparison = replace(comparison, covariance=gain @ of_detector)
+        result = _moved(result, rows, detections, J, (gain @ difference[..., None])[..., 0], difference)
+    return replace(result, comparison=result.comparison.put(rows, comparison))
 
 
 def _moved(
-    result: RefinementResult, rows: Tensor, detections: Detections, images: _Images, detector_sigmas: Tensor
+    result: RefinementResult, rows: Tensor, detections: Detections, J: Tensor, target: Tensor, difference: Tensor
 ) -> RefinementResult:
-    """The result with the cars `rows` where images and detector have them together."""
-    origin = detections.T_cam_obj.detach()[rows, :3, 3].double()
-    sigmas = detector_sigmas.to(origin).repeat(len(rows), 1)
-    sigmas[:, 0] = sigmas[:, 0] * torch.hypot(origin[:, 0], origin[:, 2])
-    both = images.covariance + torch.diag_embed(sigmas**2)
-    # Symmetric, so that the gain is the transpose of what solves for the covariance.
-    gain = torch.linalg.solve_ex(both, images.covariance)[0].mT
-    difference = _difference(result, rows, detections).double()
-    target = (gain @ difference[..., None])[..., 0]
-    state = _state(result, rows)
-    for _ in range(_NUM_STEPS):
-        at = _at(result, rows, state)
-        done = difference - _difference(at, rows, detections).double()
-        state = retract(state, images.step(target - done))
-    posterior = gain @ torch.diag_embed(sigmas**2)
-    comparison = result.comparison.rows(rows)
-    return replace(
-        _at(result, rows, state),
-        comparison=result.comparison.put(rows, replace(comparison, covariance=posterior)),
-    )
+    """The result with the cars `rows` moved by a change (R, 7) of their quantities, towards the detector.
+
+    The first step is linear, which sizes in the code are not; the second one takes what is left.
+    """
+    first = retract(_state(result, rows), _least_step(J, target))
+    at = _at(result, rows, first)
+    left = target - (difference - _difference(at, rows, detections))
+    return _at(result, rows, retract(first, _least_step(J, left)))
+
+
+def _least_step(J: Tensor, change: Tensor) -> Tensor:
+    """The least step (R, D) of the tangent of `retract` that changes the quantities by so much (R, 7).
+
+    The pose changes place and heading; the shape, whose unit is its own standard deviation, changes the sizes.
+    """
+
+    def solved(J: Tensor, change: Tensor) -> Tensor:
+        ridge = _RIDGE * torch.eye(J.shape[1], dtype=J.dtype, device=J.device)
+        step: Tensor = (J.mT @ torch.linalg.solve_ex(J @ J.mT + ridge, change[..., None])[0])[..., 0]
+        return step
+
+    return torch.cat([solved(J[:, :4, :6], change[:, :4]), solved(J[:, 4:, 6:], change[:, 4:])], dim=1)
 
 
 def _state(result: RefinementResult, rows: Tensor) -> CarState:
@@ -167,7 +144,7 @@ def _at(result: RefinementResult, rows: Tensor, state: CarState) -> RefinementRe
 
 
 def _difference(result: RefinementResult, rows: Tensor, detections: Detections) -> Tensor:
-    """The boxes of the detector less those of the result, (R, 7) in `CAR_QUANTITIES`."""
+    """The boxes of the detector less those of the result, (R, 7) in `CAR_QUANTITIES`, float64."""
     T_detector, boxes = detections.T_cam_obj[rows], result.rows(rows).to_boxes("kitti")
     moved = T_detector[:, :3, 3] - boxes[:, :3]
     axes = viewing_axes(result.T_cam_obj[rows, :3, 3].detach())
@@ -176,4 +153,4 @@ def _difference(result: RefinementResult, rows: Tensor, detections: Detections) 
     # Modulo half a turn: what of a car is its front the detector says alone.
     heading = 0.5 * torch.atan2(torch.sin(2 * turned), torch.cos(2 * turned))
     height, width, length = (detections.dimensions_hwl[rows] - boxes[:, 3:6]).unbind(dim=1)
-    return torch.stack([along, across, -down, HEADING_LEVER_M * heading, length, width, height], dim=1)
+    return torch.stack([along, across, -down, HEADING_LEVER_M * heading, length, width, height], dim=1).double()

@@ -10,7 +10,12 @@ from torch import Tensor
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.records import kept
-from directshape_torch.refinement.disparity_profile import DisparityProfile, default_offsets, disparity_profile
+from directshape_torch.refinement.disparity_profile import (
+    APART_PX,
+    DisparityProfile,
+    default_offsets,
+    disparity_profile,
+)
 from directshape_torch.refinement.observability import (
     covariance_of,
     covariance_xyz_yaw,
@@ -41,10 +46,9 @@ _SETTLED_SHARE = 0.005
 _LEAST_MASK_IOU = 0.65
 # Of these cars at least 0.68 of the pixels could be compared.
 _LEAST_MATCHED_SHARE = 0.1
-# How far from where it ended the pixels of a car may have their best disparity, and how sharply they must know it,
-# pixels. Most boxes and masks that are laid on other images break one of both, of cars that are there one or two in a
-# hundred (scripts/calibrate_fusion.py, column "elsewhere").
-_LARGEST_OFFSET_PX, _LARGEST_OFFSET_SIGMA_PX = 0.75, 0.5
+# The pixels of a car that is there have their best disparity where it ended, and know it to this many pixels. Most
+# boxes and masks that are laid on other images fail in this (scripts/calibrate_fusion.py, column "elsewhere").
+_LARGEST_OFFSET_SIGMA_PX = 0.5
 # Sigma along the viewing ray over the depth; of these cars at most 0.1.
 _LARGEST_DEPTH_SHARE = 0.2
 
@@ -224,7 +228,7 @@ def has_evidence(end: CarState, found: RefinementResult) -> Tensor:
     if "photometric" in found.term_names:
         # Its pixels are those of the left mask.
         at_end = found.profile.after
-        is_there = (at_end.offset_px.abs() < _LARGEST_OFFSET_PX) & (at_end.sigma_px < _LARGEST_OFFSET_SIGMA_PX)
+        is_there = (at_end.offset_px.abs() < APART_PX) & (at_end.sigma_px < _LARGEST_OFFSET_SIGMA_PX)
         seen = seen & (((quality.matched_share >= _LEAST_MATCHED_SHARE) & is_there) | left.isnan())
     return seen
 

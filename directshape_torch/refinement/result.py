@@ -310,12 +310,12 @@ class RefinementResult(CarRecord):
 
     @property
     def sigma_xyz_yaw(self) -> Tensor:
-        """Calibrated standard deviations (B, 4) of the box's place in `ref` and of its heading, metres and radians.
+        """Standard deviations (B, 4) of the box's place in `ref` and of its heading, metres and radians.
 
-        NaN for cars that were not refined. Calibrated with the default settings on rendered frames for boxes of the
-        images alone; where they were brought together with the detector's, scales of Student's t of 4 degrees of
-        freedom, fitted on KITTI. A rig's own disparity error is in
-        them as far as the covariance of its field, `rig.disparity_sigma_px` or `Detections.offset_sigma_px` says.
+        They are NaN for cars that were not refined. Those of boxes of the images alone are calibrated with the default
+        settings on rendered frames; those of boxes that were brought together with the detector's are scales of
+        Student's t of 4 degrees of freedom, fitted on KITTI. A rig's own disparity error is in them as far as the
+        covariance of its field, `rig.disparity_sigma_px` or `Detections.offset_sigma_px` says.
         """
         location = self.T_cam_obj[:, :3, 3]
         of_images = bundled_trust_model().calibrated_covariance(self.covariance_xyz_yaw, location)

@@ -7,23 +7,36 @@ images' added, averaged over a grid with a prior of what detectors have, from Li
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-COLUMNS = 15
-"""Of a row: distance along the ground, metres; seven differences and seven standard deviations of the images, see
-`refinement.fusion.DetectorComparison`."""
+if TYPE_CHECKING:
+    from directshape_torch.refinement.fusion import DetectorComparison
 
-# Middle and spread (of the logarithm) of the standard deviations of detectors: of the depth as a share of the distance,
-# sideways, height, heading (times 2 m), length, width and height, metres.
+NUM_COLUMNS = 15
+"""Of the rows that `rows_of` makes."""
+
+# What the standard deviations of detectors are: their middle, and the spread of their logarithm. That of the depth is a
+# share of the distance; sideways position, height above ground, heading (times 2 m), length, width and height are
+# metres.
 _MIDDLE = (0.02, 0.12, 0.06, 0.16, 0.35, 0.08, 0.08)
 _SPREAD = (1.2, 0.8, 0.6, 1.0, 0.5, 0.5, 0.5)
-_FACTORS = torch.linspace(-4, 3, 71, dtype=torch.float64).exp()
+# Standard deviations that are tried, as multiples of the middle.
+_TRIED = torch.linspace(-4, 3, 71, dtype=torch.float64).exp()
 _DEGREES_OF_FREEDOM = 4
-# Results keep something of their start, and the energy holds shapes to the detector's dimensions: so much of what a
-# detector is off by shows, over the labels of KITTI and of rendered frames (scripts/calibrate_fusion.py).
+# Results keep something of their start, and the energy holds shapes to the detector's dimensions, so that no more than
+# this share of what a detector is off by shows. Over labels it is less (scripts/calibrate_fusion.py): then the
+# detector counts for more than it should, which does no harm.
 _SHOWN = (0.77, 0.77, 0.77, 0.77, 0.5, 0.5, 0.5)
+
+
+def rows_of(comparison: DetectorComparison) -> Tensor:
+    """A row (N, 15) for each car that was compared: distance (metres), seven differences, seven standard deviations."""
+    parts = comparison.distance[:, None], comparison.difference, comparison.sigma_images
+    rows = torch.cat(parts, dim=1).detach()
+    return rows[rows.isfinite().all(dim=1)].cpu()
 
 
 def detector_sigmas(
@@ -41,7 +54,7 @@ def detector_sigmas(
     units = torch.ones_like(difference)
     units[:, 0] = distance
     middle, spread, shown = (torch.tensor(x, dtype=torch.float64) for x in (_MIDDLE, _SPREAD, _SHOWN))
-    noise = _FACTORS[:, None] * middle
+    noise = _TRIED[:, None] * middle
     variance = (noise[:, None] * units) ** 2 + sigma**2
     nu = _DEGREES_OF_FREEDOM
     log_likelihood = -0.5 * (variance.log() + (nu + 1) * torch.log1p(difference**2 / variance / nu)).sum(dim=1)

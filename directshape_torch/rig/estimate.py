@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -78,7 +78,7 @@ class RigEstimate(nn.Module):
         matrices = (matrix.detach().double().cpu() for matrix in (K_left, K_right, T_right_cam))
         self._blank = DisparityField.constant(0.0, size_wh, *matrices)
         self.rows = torch.zeros(0, len(COLUMNS), dtype=torch.float64)
-        self.results = torch.zeros(0, detector_noise.COLUMNS, dtype=torch.float64)
+        self.results = torch.zeros(0, detector_noise.NUM_COLUMNS, dtype=torch.float64)
         self.pixels: dict[str, PixelEvidence] = {}
         self._solved: tuple[Posterior, DisparityField] | None = None
 
@@ -97,8 +97,7 @@ class RigEstimate(nn.Module):
         Raises:
             InputError: frames of another rig.
         """
-        for number in range(len(frames)):
-            self._blank.check_rig(*Rig.of_frame(frames, number))
+        self._check_frames(frames)
         self.add_rows(observe_detections(frames, detections))
 
     def add_rows(self, rows: Tensor) -> None:
@@ -118,23 +117,27 @@ class RigEstimate(nn.Module):
         """Take in how far refined cars lie from the detector's boxes, which says what these are off by.
 
         Args:
-            frames: of this rig, that were not learnt from before.
-            result: of a refiner with this estimate, of these frames.
+            frames: of this rig.
+            result: of a refiner with this estimate, of these frames; the same again says nothing new.
 
         Raises:
             InputError: frames of another rig.
         """
+        self._check_frames(frames)
+        self.add_results(detector_noise.rows_of(result.comparison))
+
+    def _check_frames(self, frames: FrameBatch) -> None:
+        """Raise `InputError` for frames of another rig."""
         for number in range(len(frames)):
             self._blank.check_rig(*Rig.of_frame(frames, number))
-        known = result.comparison.sigma_images.isfinite().all(dim=1) & (result.track_part < 0)
-        distance = torch.hypot(result.T_cam_obj[:, 0, 3], result.T_cam_obj[:, 2, 3]).double()
-        comparison = result.comparison
-        rows = torch.cat([distance[:, None], comparison.difference, comparison.sigma_images], dim=1)
-        self.add_results(rows[known].detach().cpu())
 
     def add_results(self, rows: Tensor) -> None:
-        """Take in comparisons of results with detections, (N, 15) `rig.detector_noise.COLUMNS`, else `InputError`."""
-        check_shape("rows", rows, ("N", detector_noise.COLUMNS), kind="floating")
+        """Take in comparisons of results with detections, (N, 15) as `detector_noise.rows_of` makes them.
+
+        Raises:
+            InputError: another shape, or numbers that are none of a comparison.
+        """
+        check_shape("rows", rows, ("N", detector_noise.NUM_COLUMNS), kind="floating")
         if not bool(rows.isfinite().all()) or bool((rows[:, 8:] <= 0).any()):
             raise InputError("rows", "finite differences and standard deviations above 0", "others")
         self.results = _kept_rows(torch.cat([self.results, rows.detach().to(self.results)]))
@@ -260,13 +263,8 @@ class RigEstimate(nn.Module):
         size_wh, *matrices = (list(part) if isinstance(part, tuple) else part.tolist() for part in self._blank.rig)
         pixels = {kind: {n: _plain(x) for n, x in sums._asdict().items()} for kind, sums in self.pixels.items()}
         rig = dict(zip(("K_left", "K_right", "T_right_cam"), matrices, strict=True))
-        return {
-            "size_wh": size_wh,
-            **rig,
-            "rows": self.rows.tolist(),
-            "results": self.results.tolist(),
-            "pixels": pixels,
-        }
+        seen = {"rows": self.rows.tolist(), "results": self.results.tolist(), "pixels": pixels}
+        return {"size_wh": size_wh, **rig, **seen}
 
     @classmethod
     def of_content(cls, content: Any) -> Self:
@@ -276,8 +274,8 @@ class RigEstimate(nn.Module):
             sizes = {"K_left": 3, "K_right": 3, "T_right_cam": 4}
             rig = cls((width, height), *(to_tensor(content, name, (n, n)) for name, n in sizes.items()))
             rig.add_rows(to_tensor(content, "rows", (None, len(COLUMNS))))
-            # Files of before know no results.
-            rig.add_results(to_tensor({"results": [], **content}, "results", (None, detector_noise.COLUMNS)))
+            # Files of earlier versions hold no results.
+            rig.add_results(to_tensor({"results": [], **content}, "results", (None, detector_noise.NUM_COLUMNS)))
             for kind, sums in content["pixels"].items():
                 points, frames, *names = PixelEvidence._fields
                 tensors = (to_tensor(sums, name, shape) for name, shape in zip(names, _OF_PIXELS, strict=True))
@@ -329,52 +327,6 @@ class RigEstimate(nn.Module):
         corners = [(self.rows[:, None, :2] + around).reshape(-1, 2), *(e.hull_uv for e in self.pixels.values())]
         uv = torch.cat(corners)
         return hull(uv) if len(uv) else self._blank.hull_uv
-
-
-class RigEstimates(nn.ModuleList):
-    """Those of several rigs, for a refiner whose calls have frames of one of them each."""
-
-    def __init__(self, rigs: Sequence[RigEstimate]) -> None:
-        super().__init__(rigs)
-
-    def corrected(self, frames: FrameBatch) -> FrameBatch:
-        """See `RigEstimate`; frames of a rig that nobody knows stay as they are."""
-        rig = self._of(frames)
-        return frames if rig is None else rig.corrected(frames)
-
-    def informed(self, frames: FrameBatch, detections: Detections) -> Detections:
-        """See `RigEstimate`."""
-        rig = self._of(frames)
-        return detections if rig is None else rig.informed(frames, detections)
-
-    def learn(self, frames: FrameBatch, result: RefinementResult) -> None:
-        """See `RigEstimate`; results of a rig that nobody knows say nothing."""
-        rig = self._of(frames)
-        if rig is not None:
-            rig.learn(frames, result)
-
-    @property
-    def results(self) -> Tensor:
-        """(N, 15) of all rigs, for one detector looks through all of them."""
-        known = [rig.results for rig in self if isinstance(rig, RigEstimate)]
-        return torch.cat(known) if known else torch.zeros(0, detector_noise.COLUMNS, dtype=torch.float64)
-
-    def detector_sigmas(self) -> Tensor | None:
-        """See `RigEstimate`; by the results of all rigs."""
-        results = self.results
-        return detector_noise.detector_sigmas(results) if len(results) else None
-
-    def _of(self, frames: FrameBatch) -> RigEstimate | None:
-        rig = Rig.of_frame(frames)
-        return next((known for known in self if known.is_of(*rig)), None)  # type: ignore[operator, return-value]
-
-
-def rig_among(rigs: list[RigEstimate], rig: Rig) -> RigEstimate:
-    """The estimate of that rig; one that knows nothing yet joins the list where there is none."""
-    known = [estimate for estimate in rigs if estimate.is_of(*rig)] or [RigEstimate(*rig)]
-    if known[0] not in rigs:
-        rigs.append(known[0])
-    return known[0]
 
 
 def to_tensor(entry: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) -> Tensor:

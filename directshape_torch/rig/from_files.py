@@ -24,10 +24,11 @@ from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_c
 from directshape_torch.io.layouts import tracking_layout
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.io.velodyne import read_scan
-from directshape_torch.rig.estimate import RigEstimate, rig_among
+from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.motion import STEPS, StereoFeatures, find_features, track_features
 from directshape_torch.rig.pixels import observe_disparity, pixel_evidence
 from directshape_torch.rig.rig import Rig
+from directshape_torch.rig.rigs import rig_among
 from directshape_torch.rig.self_calibration import FieldConstraint, find_road
 from directshape_torch.stereo_matching.patch_alignment import MatchedPair
 

@@ -18,7 +18,8 @@ from directshape_torch.stereo_matching.disparity import match_disparity
 AGREEMENT_ERROR, AGREEMENT_WARNING = 0.5, 0.6
 # What another way to read a scan must gain.
 _MIN_GAIN = 0.2
-_TIE = 0.03
+# Ways with so much fewer points that agree count as equals.
+_TIE = 0.05
 # Both in pixels and as a share: the error of a rig's disparity and that of the matching.
 _TOLERANCE_PX, _TOLERANCE_SHARE = 2.0, 0.05
 # Roads look alike in all frames, so points that far below the camera say little.
@@ -89,16 +90,20 @@ def _finding(severity: Severity, where: str, share: float, fits: str, cure: str)
 
 
 def _better_way(judges: Sequence[_Judge], mean: float) -> tuple[str, str] | None:
-    """Words for the way to read the scans that fits clearly better, the simplest of equals, and its cure."""
+    """Words for the way to read the scans that fits clearly better, the simplest of equals, and its cure.
+
+    The way with most points that agree is taken: wrong columns leave a part of the points whole, which agree as well.
+    """
     ways = [way for way in _ways() if all(way.is_possible(judge.scan) for judge in judges)]
-    shares = np.array([np.mean([judge.share(way) for judge in judges]) for way in ways])
-    close = np.flatnonzero(shares > shares.max() - _TIE).tolist()
+    counts = np.array([np.mean([judge.count(way) for judge in judges]) for way in ways])
+    close = np.flatnonzero(counts >= (1 - _TIE) * counts.max()).tolist()
     scan = judges[0].scan
-    best = min(close, key=lambda k: (len(ways[k].words(scan)), -shares[k]))
-    if shares[best] < AGREEMENT_ERROR or shares[best] < mean + _MIN_GAIN:
+    best = min(close, key=lambda k: (len(ways[k].words(scan)), -counts[k]))
+    share = np.mean([judge.share(ways[best]) for judge in judges])
+    if share < max(AGREEMENT_ERROR, mean + _MIN_GAIN):
         return None
     words = ", ".join(ways[best].words(scan))
-    fits = f", {shares[best]:.0%} when the scan is read {words}"
+    fits = f", {share:.0%} when the scan is read {words}"
     return fits, f"give points as documented (docs/inputs.md): they fit when read {words}"
 
 
@@ -153,12 +158,16 @@ class _Judge:
         self.can_tell = int(np.isfinite(self.disparity).sum()) >= _MOST_POINTS
         documented = _as_documented(scan)
         # Of wrong columns some points are whole, and most of the others fall out of the image.
-        self._fewest = max(float(self._agree(documented._replace(columns=count)).sum()) for count in scan.points)
+        self._fewest = max(self.count(documented._replace(columns=columns)) for columns in scan.points)
 
     def share(self, way: _Way) -> float:
         """Share of the points above the road whose disparity is that of the images, where that is known."""
         agree = self._agree(way)
         return float(agree.sum()) / max(len(agree), self._fewest, _FEWEST_POINTS)
+
+    def count(self, way: _Way) -> float:
+        """How many of the points that are read agree."""
+        return float(self._agree(way).sum())
 
     def _agree(self, way: _Way) -> Floats:
         points_cam = _points(self.scan, way)

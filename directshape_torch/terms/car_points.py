@@ -15,7 +15,7 @@ from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.rows import PointSamples
 from directshape_torch.scene import Detections, FrameBatch
 
-# Of a part of the cars: some 200 bytes each.
+# So many pixels, of some cars, are looked at together; each takes some 200 bytes.
 _MOST_PIXELS = 2**20
 # Above the ground plane: lower points are road, higher ones trees.
 _HEIGHTS_M = (0.1, 3.0)
@@ -50,8 +50,8 @@ def car_points(frames: FrameBatch, detections: Detections, config: PointCloudCon
 def _points(
     frames: FrameBatch, detections: Detections, disparity: Tensor, pixels: Tensor
 ) -> tuple[Tensor, Tensor]:  # (P,), (P, 3)
-    """The points at pixels, those that may be their car's: its number and where they are."""
-    object_index, v, u = pixels  # (3, P)
+    """The points at pixels (3, P) that may belong to their car: the numbers of the cars, and where the points are."""
+    object_index, v, u = pixels
     known = _known(disparity[detections.frame_index[object_index], v, u]).nonzero()[:, 0]
     object_index, v, u = object_index[known], v[known], u[known]
     frame = detections.frame_index[object_index]

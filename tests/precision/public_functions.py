@@ -368,7 +368,8 @@ CASES: dict[str, Case] = {
 # These compute nothing from tensors, or are what another one here calls.
 WITHOUT_NUMBERS = {
     "BoxForm.order", "BoxForm.place", "Detections.has_mask_left", "Detections.has_mask_right",
-    "Detections.telling_rows", "MaskCrops.areas", "MaskCrops.at", "MaskCrops.box_2d", "MaskCrops.crop",
+    "Detections.telling_rows", "DirectShapeRefiner.detector_sigmas", "DirectShapeRefiner.weighs_detector",
+    "MaskCrops.areas", "MaskCrops.at", "MaskCrops.box_2d", "MaskCrops.crop",
     "MaskCrops.dense", "MaskCrops.extents", "MaskCrops.joined", "MaskCrops.none", "MaskCrops.of", "MaskCrops.of_boxes",
     "MaskCrops.padded", "MaskCrops.rows", "MaskCrops.where", "box_formats.box_form", "box_formats.check_upright",
     "image_boxes.enclosing_boxes",

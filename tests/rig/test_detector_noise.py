@@ -10,9 +10,10 @@ from torch import Tensor
 from directshape_torch import RigEstimate
 from directshape_torch.errors import InputError
 from directshape_torch.rig.detector_noise import detector_sigmas, in_words
-from directshape_torch.rig.estimate import RigEstimates
+from directshape_torch.rig.rigs import RigEstimates
 
-# Of the depth as a share of the distance, sideways, height, heading (times 2 m), length, width, height.
+# Standard deviations: depth as a share of the distance; sideways, height, heading (times 2 m), length, width and height
+# in metres.
 LIDAR = torch.tensor([0.003, 0.04, 0.03, 0.04, 0.2, 0.05, 0.05], dtype=torch.float64)
 MONO = torch.tensor([0.06, 0.25, 0.1, 0.3, 0.5, 0.12, 0.12], dtype=torch.float64)
 IMAGES = torch.tensor([0.15, 0.05, 0.05, 0.06, 0.2, 0.06, 0.05], dtype=torch.float64)

@@ -98,6 +98,15 @@ def test_wrong_scans_are_named(
     assert words in f"{finding.measured}; {finding.cure}"
 
 
+def test_the_columns_of_the_file_are_believed_where_they_fit(demo: tuple[Path, Points], tmp_path: Path) -> None:
+    """Read with six numbers a point two in three of the points are whole, here those that are measured better."""
+    root, points = demo
+    points = points[: len(points) // 3 * 3].copy()
+    points[1::3, :3] += np.random.default_rng(0).normal(0, 1.5, (len(points) // 3, 3))
+    (finding,) = report_of(root, tmp_path, points[:, [1, 0, 2, 3]]).findings
+    assert "fit when read with the axes x and y exchanged" in finding.cure
+
+
 def test_a_wrong_place_of_the_scanner_is_named(demo: tuple[Path, Points], tmp_path: Path) -> None:
     root, points = demo
     wrong = tmp_path / "data"

@@ -27,5 +27,5 @@ def test_cars_of_the_demo_are_judged(capsys: pytest.CaptureFixture[str]) -> None
     row = next(line for line in lines if line.startswith("| demo noisy_stereo | 6 | "))
     before, alone, together = (float(row.split("|")[column].split()[0]) for column in (3, 4, 6))
     assert before < together < alone + 0.02
-    assert any(line.startswith("| package | 0.50, 0.108 m | ") for line in lines)
+    assert any(line.startswith("| package | 0.47, 0.136 m | ") for line in lines)
     assert lines[-1].count("|") == 9
