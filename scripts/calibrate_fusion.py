@@ -76,7 +76,7 @@ class Cars:
         return torch.cat([rows_of(fused(frame.result, each, None, noise).comparison) for frame, each in pairs])
 
     def overlaps(self, noise: ImageNoise | None) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Overlaps with the labels of the input, and of the boxes that some noise of the images gives; None: theirs."""
+        """Overlaps of the input and of the fused boxes with the labels; without a noise the images' boxes stay."""
         sigmas = None if noise is None else detector_sigmas(self.comparisons(noise))
         before, after = [], []
         for frame in self.frames:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from directshape_torch.refinement.fusion import DetectorComparison
 
 NUM_COLUMNS = 15
-"""Of the rows that `rows_of` makes."""
+"""The number of columns of the rows that `rows_of` makes."""
 
 # What the standard deviations of detectors are: their middle, and the spread of their logarithm. That of the depth is a
 # share of the distance; sideways position, height above ground, heading (times 2 m), length, width and height are

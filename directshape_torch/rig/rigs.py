@@ -18,23 +18,23 @@ if TYPE_CHECKING:
 
 
 class RigEstimates(nn.ModuleList):
-    """Those of several rigs, for a refiner whose calls have frames of one of them each."""
+    """The estimates of several rigs, for a refiner whose calls each have frames of one of them."""
 
     def __init__(self, rigs: Sequence[RigEstimate]) -> None:
         super().__init__(rigs)
 
     def corrected(self, frames: FrameBatch) -> FrameBatch:
-        """See `RigEstimate`; frames of a rig that nobody knows stay as they are."""
+        """The frames as the estimate of their rig corrects them; frames of an unknown rig stay as they are."""
         rig = self._of(frames)
         return frames if rig is None else rig.corrected(frames)
 
     def informed(self, frames: FrameBatch, detections: Detections) -> Detections:
-        """See `RigEstimate`."""
+        """The detections with what the estimate of their rig knows; those of an unknown rig stay as they are."""
         rig = self._of(frames)
         return detections if rig is None else rig.informed(frames, detections)
 
     def learn(self, frames: FrameBatch, result: RefinementResult) -> None:
-        """See `RigEstimate`; results of a rig that nobody knows say nothing."""
+        """The estimate of the frames' rig learns from the result; a result of an unknown rig is left out."""
         rig = self._of(frames)
         if rig is not None:
             rig.learn(frames, result)
@@ -46,7 +46,7 @@ class RigEstimates(nn.ModuleList):
         return torch.cat([nothing, *(rig.results for rig in self if isinstance(rig, RigEstimate))])
 
     def detector_sigmas(self) -> Tensor | None:
-        """See `RigEstimate`; it goes by the results of all rigs."""
+        """`RigEstimate.detector_sigmas` of the results of all rigs together."""
         results = self.results
         return detector_noise.detector_sigmas(results) if len(results) else None
 
