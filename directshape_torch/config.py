@@ -130,10 +130,10 @@ class RigConfig(Settings):
     """What is known beforehand of the stereo rig."""
 
     disparity_sigma_px: float = setting(
-        0.0,
-        "standard deviation of an unknown offset of the disparity, one for each car, which weighs depth by disparity "
-        "against the size of the silhouettes and the detector's depth: about 0.1 where a residual disparity field was "
-        "fitted, 0.5 and more where none was; 0 for no such unknown but that of an estimate from few detections",
+        0.3,
+        "standard deviation of an unknown offset of the disparity, one for each car, where neither a rig nor a "
+        "disparity field nor the detections say what the cameras are off by; it weighs depth by disparity "
+        "against the size of the silhouettes and the detector's depth; 0: cameras are exact, as of rendered images",
         at_least=0,
     )
 
@@ -355,13 +355,13 @@ class AcceptanceConfig(Settings):
     """Which results are returned; the input stands in for the others (status not_trusted)."""
 
     min_probability_better: float = setting(
-        0.7,
+        0.5,
         'least probability that the BEV IoU rose (docs/results.md, "When to trust a result")',
         at_least=0,
         at_most=1,
     )
     min_probability_not_worse: float = setting(
-        0.0,
+        0.8,
         "least probability that it fell by at most 0.05; 0 for both returns every result",
         at_least=0,
         at_most=1,

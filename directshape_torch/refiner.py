@@ -20,7 +20,7 @@ from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.gradient_mode import is_within_transform
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import check_fit, check_no_tangents, in_dtype_of, refusals
-from directshape_torch.refinement.fusion import fused
+from directshape_torch.refinement.fusion import UNKNOWN_DETECTOR, fused, noise_of_boxes
 from directshape_torch.refinement.outcome import as_they_came
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.result import RefinementResult
@@ -58,7 +58,8 @@ class DirectShapeRefiner(nn.Module):
         config: settings; default `RefinerConfig()`, the same as `configs/default.yaml`.
         extra_terms: make terms of one's own for the cars of a call (docs/extra_terms.md), beside those of the method.
         rig: corrects frames that bring no disparity field of their own, and says how good the detector's depths and
-            its own field are where nobody else does: a `RigEstimate`, which lives in the `state_dict` too.
+            its own field are where nobody else does: a `RigEstimate`, which lives in the `state_dict` too. Without one
+            cameras may be off by `config.rig.disparity_sigma_px`, and detectors are taken to be as most are.
 
     Raises:
         InputError: a prior without the members or derivatives that `ShapePrior` lists; settings that are no
@@ -103,7 +104,7 @@ class DirectShapeRefiner(nn.Module):
         With `config.backward.mode` other than "none" pose and code of the result carry gradients to the masks, the
         images, the prior's tensors, the term weights, the disparity that the frames bring and the detector's standard
         deviations; to the input poses with "unroll", and in the other modes where there are such standard deviations,
-        or a rig that has learnt what the detector is off by.
+        or where results are brought together with the detector's boxes (`weighs_detector`).
 
         Args:
             frames: F frames; dtype and device must be those of the prior.
@@ -133,6 +134,7 @@ class DirectShapeRefiner(nn.Module):
         # Standard deviations that are given are a prior of the energy, beside which the box must not count again.
         sigmas = self.detector_sigmas if detections.pose_sigma is None else None
         frames, detections = self._with_rig(frames, detections)
+        noise = None if sigmas is None else noise_of_boxes(sigmas, detections.T_cam_obj)
         of_prior = (tensor for _, tensor in (*self.prior.named_buffers(), *self.prior.named_parameters()))
         check_no_tangents(frames, detections, (*(term_weights or {}).values(), *of_prior))
         self._warn_of(frames, detections)
@@ -143,12 +145,12 @@ class DirectShapeRefiner(nn.Module):
             full_precision(),
             compiling(self.config.compile, len(detections)),
         ):
-            result = self._refine(frames, detections, term_weights)
-            return result if self.rig is None else fused(result, detections, sigmas)
+            result = self._refine(frames, detections, term_weights, noise)
+            return result if noise is None else fused(result, detections)
 
     @property
     def weighs_detector(self) -> bool:
-        """Whether results are brought together with the detector's boxes once a rig knows what these are off by.
+        """Whether results are brought together with the detector's boxes.
 
         What the images are off by was measured with the method "direct", and standard deviations that the settings give
         are a prior of the energy.
@@ -158,9 +160,20 @@ class DirectShapeRefiner(nn.Module):
 
     @property
     def detector_sigmas(self) -> Tensor | None:
-        """Standard deviations (7,) by which the detector's boxes count, see `refinement.fusion.fused`, or None."""
-        known = self.rig.detector_sigmas() if self.rig is not None and self.weighs_detector else None
-        return None if known is None else known / math.sqrt(self.config.priors.detector_weight)
+        """Standard deviations (7,) by which the detector's boxes count, see `RigEstimate.detector_sigmas`, or None.
+
+        Of a detector of which nothing has been learnt they are those of most detectors.
+        """
+        if not self.weighs_detector:
+            return None
+        learnt = None if self.rig is None else self.rig.detector_sigmas()
+        return (UNKNOWN_DETECTOR if learnt is None else learnt) / math.sqrt(self.config.priors.detector_weight)
+
+    def _is_rig_unknown(self, frames: FrameBatch) -> bool:
+        """Whether neither a field, a rig's or the frames' own, nor the settings say what the cameras are off by."""
+        is_known = frames.camera.disparity_field is not None or self.config.rig.disparity_sigma_px == 0
+        # The other methods' points and boxes know no offset.
+        return not is_known and self.config.method == "direct"
 
     def _warn_of(self, frames: FrameBatch, detections: Detections) -> None:
         """Mistakes that the tensors of this call show, as the setting `check` asks."""
@@ -188,13 +201,17 @@ class DirectShapeRefiner(nn.Module):
             warnings.warn(f"{', '.join(wanted)} get no gradient: {cure}", NoGradientWarning, stacklevel=6)
 
     def _refine(
-        self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None
+        self,
+        frames: FrameBatch,
+        detections: Detections,
+        term_weights: Mapping[str, Tensor] | None,
+        detector_noise: Tensor | None,
     ) -> RefinementResult:
         seen = self._observe(frames, detections)
         failure = refusals(frames, detections, seen, self.config)
         usable = failure < 0
         rows = usable.nonzero()[:, 0]
-        cars = self._cars(frames, detections).of_cars(usable)
+        cars = replace(self._cars(frames, detections), detector_noise=detector_noise).of_cars(usable)
         problem = problem_of_scene(
             self.config, self.prior, frames, detections, cars, seen.of_objects(usable), self.extra_terms, term_weights
         )
@@ -231,12 +248,13 @@ class DirectShapeRefiner(nn.Module):
         if any(self.config.priors.pose_sigmas):
             informed = replace(informed, pose_sigma=detections.pose_sigma)
         # The other methods' points and boxes know no offset.
-        if self.config.rig.disparity_sigma_px or self.config.method != "direct":
+        if self.config.method != "direct":
             informed = replace(informed, offset_sigma_px=detections.offset_sigma_px)
         return frames, informed
 
     def _cars(self, frames: FrameBatch, detections: Detections) -> CarBatch:
-        return CarBatch.from_scene(frames, detections, self.config.rig.disparity_sigma_px)
+        sigma_px = self.config.rig.disparity_sigma_px if self._is_rig_unknown(frames) else 0.0
+        return CarBatch.from_scene(frames, detections, sigma_px)
 
     def _input_state(self, T_cam_obj: Tensor, cars: CarBatch) -> CarState:
         code = self.prior.initial_code(len(T_cam_obj)).to(T_cam_obj)

@@ -195,7 +195,7 @@ class Detections(TensorRecord):
             and of the heading (radians). Infinity where not known. None: the settings' (`priors.pose_sigma_*`) or the
             rig's, if any; collated with frames that have some, infinity stands for none.
         offset_sigma_px: (B,) standard deviation of the rig's disparity at each car about its calibration, pixels of
-            full resolution; 0 where it is known. None: the settings' (`rig.disparity_sigma_px`), else the rig's;
+            full resolution; 0 where it is known. None: the rig's, else the settings' (`rig.disparity_sigma_px`);
             collated with frames that have some, 0 stands for none.
         track_id: (B,) int64 or int32: detections of one number are views of one car in several frames, which get one
             shape (docs/tracks.md); below 0: a car by itself. None: all of them are.

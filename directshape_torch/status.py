@@ -28,10 +28,22 @@ class Status(enum.Enum):
         "the result is too likely to be worse than the input, which is returned instead; check masks and stereo "
         "calibration, or set both probabilities of `acceptance` to 0 to have it all the same"
     )
-    no_evidence = (
-        "nothing in the images confirms the result, so the input is returned: its shape misses the masks, its pixels "
-        "match elsewhere or nowhere, or the depth is unknown by a fifth; check units and frame of boxes, masks, "
-        "calibration"
+    mask_missed = (
+        "the refined shape misses the instance mask, so the input is returned; check that mask and box are of one car, "
+        "and units and frame of boxes and calibration"
+    )
+    no_match = (
+        "the car's pixels match elsewhere or nowhere in the right image, so the input is returned; check the stereo "
+        "calibration, that both images are of one time, and that the mask shows the car"
+    )
+    depth_unknown = (
+        "the images leave a fifth of the depth unknown, so the input is returned; the car is too far, or has too few "
+        "pixels"
+    )
+    no_car = (
+        "what the mask shows is probably not this car, so the input is returned: halves of it lie at different depths, "
+        "it looks unlike itself in the right image, or its place is more standard deviations from the detector's than "
+        "a car's is; check that mask and box are of one car"
     )
 
     @property

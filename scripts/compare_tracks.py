@@ -48,6 +48,9 @@ _WORSE = 0.05
 _WITHIN_SIGMAS = 2.0
 _DISTANCES_M = (0.0, 12.0, 20.0, 30.0, np.inf)
 
+# Without --rig cameras are exact, and what the images say is compared.
+_AS_IT_IS = "rig.disparity_sigma_px=0", "priors.detector_weight=0"
+
 
 @dataclass(frozen=True)
 class CarOfFrame:
@@ -93,7 +96,7 @@ def run(args: argparse.Namespace) -> None:
     dataset = open_dataset(
         args.layout, args.data, args.detections, args.masks, tracks=True, split=args.split, frames=args.frames
     )
-    refiner = DirectShapeRefiner(load_prior(args.prior), load_config(None, args.set))
+    refiner = DirectShapeRefiner(load_prior(args.prior), load_config(None, [*_AS_IT_IS, *args.set]))
     if args.rig is not None:
         rigs = load_rigs(args.rig)
         dataset = replace(dataset, disparity_fields=tuple(rig.field for rig in rigs))

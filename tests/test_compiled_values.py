@@ -32,7 +32,7 @@ SUMS: list[tuple[int, ...]] = [(), (1, 2), (1, 2), (1, 2)]  # cost, products, in
 COMPONENT_AXES: dict[str, list[tuple[int, ...]]] = {
     "marched_views": [(0,), (), (), (0,), (0,), (0,), (), ()],
     "parts_of": [*SUMS[:3], (2,), (0,), (), (), (0,), *SUMS[:3], (2,), (0,), (0,), (), (), (), *(4 * SUMS)],
-    "shifted_costs": [(0,)],
+    "shifted_costs": [(0, 1)],
 }
 
 # Of the mean size of a component, and metres or whatever its unit is. Rounding takes a pixel over a threshold now and

@@ -17,7 +17,6 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.box_formats import boxes_to_poses, poses_to_boxes
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.stereo_dataset import open_dataset
-from directshape_torch.refinement.quality import EVIDENCE_NAMES
 from directshape_torch.shape.zero_level import sdf_to_mesh, zero_level_extents
 
 PRIOR = PCAShapePrior.load_bundled().double()
@@ -95,7 +94,14 @@ def test_standard_deviations_are_in_the_frame_of_the_points_and_no_mask_is_judge
     expected = J @ one.covariance_xyz_yaw @ J.T
     torch.testing.assert_close(in_camera.covariance_xyz_yaw, expected, atol=1e-9, rtol=1e-4)
     assert one.quality.mask_iou_left.isnan().all()
-    assert one.quality.evidence[:, EVIDENCE_NAMES.index("mask_misfit_left")].isnan().all()
+
+
+def test_points_alone_say_where_the_car_is() -> None:
+    """A box that stands beside its points draws no car to it."""
+    points, _ = cars(True)
+    beside = torch.tensor([[0.0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0]])
+    right, wrong = (fit_shape(points, TRUE_BOXES + off, "mmdet3d_lidar", PRIOR) for off in (0 * beside, beside))
+    assert (wrong.distance_after_m < 1.3 * right.distance_after_m + 1e-3).all()
 
 
 def test_a_car_without_points_keeps_its_box_and_touches_no_other() -> None:

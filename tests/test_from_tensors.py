@@ -345,7 +345,7 @@ def test_results_are_stored_without_pickles() -> None:
     with pytest.raises(InputError, match=r"prior: expected the prior of the result, with \d codes"):
         RefinementResult.from_state_dict(replace(result, code=result.code[:, :1]).state_dict(), PRIOR)
     covariance = torch.eye(4, dtype=torch.float64).expand(len(result), 4, 4).clone()
-    covariance[1, 0, 2] = covariance[1, 2, 0] = 1e6  # of nothing: the variance along the ray is below 0
+    covariance[1, 0, 0] = -1.0  # of nothing
     for wrong in ({"code": 0 * result.code + 1e9}, {"covariance_xyz_yaw": covariance}):
         with pytest.raises(InputError, match=r"state: expected finite boxes .*, got none of cars \[.*1"):
             RefinementResult.from_state_dict(state | wrong, PRIOR)

@@ -11,14 +11,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.config import RefinerConfig
+from directshape_torch.config import RefinerConfig, RigConfig
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses, is_z_up
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.numerics.checks import check_shape
 from directshape_torch.numerics.conversion import Given, as_floating
 from directshape_torch.numerics.full_precision import full_precision
-from directshape_torch.refinement.quality import EVIDENCE_NAMES
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rows import PointSamples
@@ -111,18 +110,20 @@ def fit_shape(
     J_points_cam[:, 3, 3] = -1 if is_z_up(convention) else 1
     covariance = J_points_cam @ fitted.covariance_xyz_yaw @ J_points_cam.mT
     # The masks are invented.
-    iou, evidence = fitted.quality.mask_iou_left, fitted.quality.evidence.clone()
-    evidence[:, EVIDENCE_NAMES.index("mask_misfit_left")] = torch.nan
-    quality = replace(fitted.quality, mask_iou_left=torch.full_like(iou, torch.nan), evidence=evidence)
+    quality = replace(fitted.quality, mask_iou_left=torch.full_like(fitted.quality.mask_iou_left, torch.nan))
     cars = replace(fitted, T_cam_obj=kept, covariance_xyz_yaw=covariance, quality=quality)
     return ShapeFit(cars, samples.counts, *distances)
 
 
 def _fitter(prior: ShapePrior | None, samples: PointSamples) -> DirectShapeRefiner:
     """A refiner whose terms are the points and the priors."""
-    plain = RefinerConfig(compile="off", check="off")
+    plain = RefinerConfig(compile="off", check="off", rig=RigConfig(0.0))
+    # Images and a detector have no part in it.
     config = replace(
-        plain, silhouette=replace(plain.silhouette, weight=0.0), photometric=replace(plain.photometric, weight=0.0)
+        plain,
+        silhouette=replace(plain.silhouette, weight=0.0),
+        photometric=replace(plain.photometric, weight=0.0),
+        priors=replace(plain.priors, detector_weight=0.0),
     )
     of_points = replace(plain.point_cloud, min_points=_LEAST_POINTS)
 

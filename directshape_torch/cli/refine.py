@@ -19,6 +19,7 @@ from directshape_torch.batch.learn_detector import learn_detector
 from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.batch.refine_dataset import check_out_dir, refine_dataset
 from directshape_torch.batch.run_summary import format_summary
+from directshape_torch.batch.verdict import verdict
 from directshape_torch.cli.options import (
     add_data_options,
     add_device_option,
@@ -110,7 +111,8 @@ def run(args: argparse.Namespace) -> int:
     options = RefineOptions(args.meshes, args.overlays, batch_frames, args.workers, args.threads, args.retries)
     chosen = [] if args.method is None else [f"method={args.method}"]
     extra = [] if args.lidar is None else [LidarPoints()]
-    refiner = make_refiner(args.config, [*args.set, *chosen], args.prior, args.device, extra)
+    known = ["rig.disparity_sigma_px=0"] if args.rig == "none" else []
+    refiner = make_refiner(args.config, [*known, *args.set, *chosen], args.prior, args.device, extra)
     if args.disparity is not None and refiner.config.method in ("direct", "box_alignment"):
         raise InputError(
             "--disparity", "a method that uses it", refiner.config.method, "add --method geometric or combined"
@@ -132,6 +134,9 @@ def run(args: argparse.Namespace) -> int:
     for warning in summary.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     print(format_summary(summary))
+    # A report finds the rigs of the folder alone.
+    for sentence in verdict(summary.frames, rigs if args.rig == "auto" else []):
+        print(f"verdict  {sentence}")
     print(f"results  {args.out}")
     return summary.exit_code
 

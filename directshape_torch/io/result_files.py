@@ -1,4 +1,4 @@
-"""What a refinement leaves behind: KITTI result files, states and shapes of frames (schema 3), tracks through them."""
+"""What a refinement leaves behind: KITTI result files, states and shapes of frames (schema 4), tracks through them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from directshape_torch.files.array_files import read_npz, write_npz
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.status import Status
 
-SHAPES_SCHEMA_VERSION = 3
+SHAPES_SCHEMA_VERSION = 4
 TRACK_SCHEMA_VERSION = 1
 _AGAIN = "refine the frame again"
 
@@ -109,6 +109,8 @@ class ShapeArrays:
     # Calibrated, see `FitQuality`.
     probabilities_better: Floats = field(metadata=shaped("B"))
     probabilities_not_worse: Floats = field(metadata=shaped("B"))
+    # Between the boxes of images and detector, in the standard deviations of both; NaN where they are not known.
+    distances_in_sigmas: Floats = field(metadata=shaped("B"))
     # Calibrated standard deviations of (x, y, z, yaw) in `ref`, metres and radians.
     sigmas_ref: Floats = field(metadata=shaped("B", 4))
     unseen: tuple[str, ...] = field(metadata=shaped("B"))  # text, the direction that the view shows least

@@ -34,6 +34,8 @@ COPIED = "copied"
 """The status of lines of other classes, which a refinement leaves as they are."""
 
 _AGAIN = "refine the frame again"
+# Cars that are not worse with less than that are named in the summary, so many of a frame at most.
+_SURE, _MOST_DOUBTFUL = 0.95, 3
 # Within the folder, whoever has written the name.
 _FILE = re.compile(r"(data|shapes|meshes|overlays)/[^/\\]+")
 
@@ -121,6 +123,7 @@ def read_done(
 def frame_entry(shapes: ShapeArrays, record: FrameRecord) -> FrameEntry:
     """What `summary.json` says of a frame that is done."""
     cars = zip(shapes.input_lines.tolist(), shapes.statuses, shapes.messages, strict=True)
+    better, worse, doubtful = _expected(shapes)
     return {
         "state": "done",
         "lines": record.lines,
@@ -130,7 +133,29 @@ def frame_entry(shapes: ShapeArrays, record: FrameRecord) -> FrameEntry:
         "ground_source": shapes.ground_source,
         "statuses": dict(Counter(shapes.statuses)),
         "no_mask": {str(line): message for line, status, message in cars if status == Status.no_mask.name},
+        "better": better,
+        "worse": worse,
+        "doubtful": doubtful,
     }
+
+
+def _expected(shapes: ShapeArrays) -> tuple[float, float, dict[str, list[float]]]:
+    """How many refined cars are better and worse than their boxes, and those that are worse most probably.
+
+    These are by line the probability to be not worse and the distance from the detector's box in standard deviations
+    (-1 where it is not known).
+    """
+    refined = np.array([Status[name].is_refined for name in shapes.statuses], dtype=bool)
+    not_worse = shapes.probabilities_not_worse
+    order = [car for car in np.argsort(not_worse, kind="stable").tolist() if refined[car] and not_worse[car] < _SURE]
+    distances = np.nan_to_num(shapes.distances_in_sigmas, nan=-1.0)
+    doubtful = {
+        str(shapes.input_lines[car]): [round(float(not_worse[car]), 3), round(float(distances[car]), 2)]
+        for car in order[:_MOST_DOUBTFUL]
+    }
+    sums = np.nansum(shapes.probabilities_better[refined]), np.nansum(1 - not_worse[refined])
+    better, worse = (round(float(total), 3) for total in sums)
+    return better, worse, doubtful
 
 
 @dataclass(frozen=True)

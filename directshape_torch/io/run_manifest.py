@@ -58,6 +58,9 @@ class FrameEntry(_FrameState, total=False):
     ground_source: str
     statuses: dict[str, int]
     no_mask: dict[str, str]
+    better: float
+    worse: float
+    doubtful: dict[str, list[float]]
 
 
 @dataclass(frozen=True)

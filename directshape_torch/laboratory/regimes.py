@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.config import AcceptanceConfig, RefinerConfig
+from directshape_torch.config import AcceptanceConfig, RefinerConfig, RigConfig
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti
@@ -100,7 +100,9 @@ def _typical(d: Draw) -> DrawnStates:
 
 def _near_optimum(d: Draw) -> DrawnStates:
     # Wherever the optimum lies, whether its box is to be trusted is another question.
-    every_result = replace(RefinerConfig(), acceptance=AcceptanceConfig(0.0, 0.0))
+    plain = RefinerConfig()
+    alone = replace(plain.priors, detector_weight=0.0)
+    every_result = replace(plain, acceptance=AcceptanceConfig(0.0, 0.0), rig=RigConfig(0.0), priors=alone)
     result = DirectShapeRefiner(d.prior, every_result)(d.scene.frame, d.scene.detections)
     return d.of_frame(result.T_cam_obj, result.code, 0.01, 0.1, 0.05)
 

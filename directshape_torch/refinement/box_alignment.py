@@ -42,7 +42,7 @@ _TOP = -0.5
 def align_boxes(problem: CarProblem, initial: CarState, cars: CarBatch, came: RefinementResult) -> RefinementResult:
     """Move the detector's boxes of B cars along the viewing rays of their origins to the lowest photometric cost.
 
-    `came` is what is known of the cars beforehand. The status is `converged`, `no_evidence` where the cost has no
+    `came` is what is known of the cars beforehand. The status is `converged`, `no_match` where the cost has no
     valley in the last range, or `non_finite`.
     """
     state = initial
@@ -54,7 +54,7 @@ def align_boxes(problem: CarProblem, initial: CarState, cars: CarBatch, came: Re
         found = profile_figures(offsets, costs, term.pixel_set.support)
         state = move_by_disparity(state, cars.focal_baseline, found.offset_px.nan_to_num(0.0).to(state.code))
     converged = found.sigma_px.isfinite()
-    status = torch.where(converged, Status.converged.code, Status.no_evidence.code)
+    status = torch.where(converged, Status.converged.code, Status.no_match.code)
     finite = costs.isfinite().all(dim=1) & cars.detector_hwl.isfinite().all(dim=1)
     status = torch.where(finite, status, Status.non_finite.code)
     term, at_end = _begun(problem, state, cars)
@@ -96,10 +96,12 @@ def moved_costs(
     """Costs (B, S), float64, of the pixels of B cars, all of whose depths are changed by S amounts in turn."""
     rows, owner = term.pixel_set.rows, term.blocks.owner
     sums, no_shift = CarSums.of(owner, len(term.cars)), torch.zeros_like(rows.rays.centre_cam[:, 0])
+    everything = torch.ones_like(rows.pixel_weight)[None]
 
     def cost(metres: Tensor) -> Tensor:
         depth, on_surface = (surface.depth + metres[owner, None])[None], surface.on_surface[None]
-        return sums.sum(shifted_costs(rows, term.config, depth, on_surface, no_shift, metres.new_zeros(1))[0, 0])
+        costs = shifted_costs(rows, term.config, everything, depth, on_surface, no_shift, metres.new_zeros(1))
+        return sums.sum(costs[0, 0, 0])
 
     return torch.stack([cost(metres) for metres in moved_m], dim=1)
 

@@ -28,6 +28,9 @@ APART_PX = 0.75
 AMBIGUOUS_BELOW = 1.25
 MAX_PIXELS = 100
 """Pixels of each car that a curve is made of by default: enough for its shape at half the time of all."""
+_TINY = 1e-9
+# Images that differ by less than this, grey levels, are as alike as images are.
+_NOISE_GREY = 2.0
 # Residuals of several offsets at once: 1 MB in single precision, for what does not stay in the caches takes longer.
 _RESIDUALS_AT_ONCE = 250_000
 
@@ -58,6 +61,8 @@ class DisparityProfile(CarRecord):
         cost_before, cost_after: (B, n) cost at the input and at the end, of the photometric term without the factors of
             single cars; NaN for cars without pixels, or that were not refined.
         num_pixels: (B,) of the curves.
+        halves_apart: (B,) by how much the costs at the end of upper, lower, left and right half of the pixels fall
+            where each takes its own best disparity, sum of the logarithms. Pixels of one car have that in common.
     """
 
     shared = frozenset({"offsets_px"})
@@ -66,11 +71,7 @@ class DisparityProfile(CarRecord):
     cost_before: Annotated[Tensor, Dense("B", "n")]
     cost_after: Annotated[Tensor, Dense("B", "n")]
     num_pixels: Annotated[Tensor, Dense("B")]
-
-    @property
-    def lowest(self) -> tuple[Tensor, Tensor]:
-        """The least cost (B,) of each curve; NaN where there is none."""
-        return self.cost_before.amin(dim=1), self.cost_after.amin(dim=1)
+    halves_apart: Annotated[Tensor, Dense("B")]
 
     def cost_at(self, offset_px: float) -> tuple[Tensor, Tensor]:
         """Costs (B,) of both curves at the sample next to an offset."""
@@ -185,18 +186,42 @@ def disparity_profile(
     per_px = -1 / (term.cars.K_right[:, 0, 0] * term.cars.T_right_cam[:, 0, 3])
     # A few offsets at a time where the pixels are many, so that memory stays that of the other evaluations.
     num_parts = -(-rows.neighbour_weight.numel() * 2 * len(offsets) // _RESIDUALS_AT_ONCE)
-    costs = torch.cat(
+    quarters = torch.cat(
         [
-            shifted_costs(rows, term.config, depth, on_surface, per_px, some)
+            shifted_costs(rows, term.config, _quarters(rows), depth, on_surface, per_px, some)
             for some in offsets.to(depth).tensor_split(num_parts)
         ],
-        dim=1,
+        dim=2,
     )
     weight = (rows.neighbour_weight.sum(dim=0) * (rows.pixel_weight > 0)).sum(dim=1, dtype=torch.float64)
     num_pixels = (rows.pixel_weight > 0).sum(dim=1)
-    means = (term.config.weight * cost.mT / weight.clamp_min(1)[:, None] for cost in costs)
-    at_input, at_end = (mean.masked_fill((num_pixels == 0)[:, None], torch.nan) for mean in means)
-    return DisparityProfile(offsets, at_input, at_end, num_pixels.to(torch.float64))
+    means = (term.config.weight * cost.mT / weight.clamp_min(1)[:, None] for cost in quarters.sum(dim=0))
+    nowhere = num_pixels == 0
+    at_input, at_end = (mean.masked_fill(nowhere[:, None], torch.nan) for mean in means)
+    noise = photometric_norm(term.config, rows.pixel_weight.new_full((1,), _NOISE_GREY)).rho
+    of_noise = (rows.pixel_weight * rows.neighbour_weight.sum(dim=0)).sum(dim=1, dtype=torch.float64) * noise
+    halves_apart = _halves_apart(quarters[:, 1], offsets, of_noise).masked_fill(nowhere, torch.nan)
+    return DisparityProfile(offsets, at_input, at_end, num_pixels.to(torch.float64), halves_apart)
+
+
+def _quarters(rows: PhotometricRows) -> Tensor:
+    """Which pixels (4, B, R) are in the upper left, upper right, lower left and lower right quarter of their car's."""
+    counts = (rows.pixel_weight > 0).to(rows.pixel_weight.dtype)
+    uv = rows.rays.ray_cam[:2] / rows.rays.ray_cam[2]
+    middle = (uv * counts).sum(dim=2, keepdim=True) / counts.sum(dim=1).clamp_min(1)[:, None]
+    right, lower = uv > middle
+    return torch.stack([~lower & ~right, ~lower & right, lower & ~right, lower & right]).to(counts.dtype)
+
+
+def _halves_apart(quarters: Tensor, offsets_px: Tensor, of_noise: Tensor) -> Tensor:
+    """`DisparityProfile.halves_apart` from costs (4, n, B) and what noise costs at least (B,)."""
+    upper_left, upper_right, lower_left, lower_right = quarters
+    halves = torch.stack(
+        [upper_left + upper_right, lower_left + lower_right, upper_left + lower_left, upper_right + lower_right]
+    )
+    halves = halves + (0.5 * of_noise).clamp_min(_TINY)
+    here = halves.index_select(1, offsets_px.abs().argmin(dim=0, keepdim=True))[:, 0]
+    return (here / halves.amin(dim=1)).log().sum(dim=0)
 
 
 def _thinned(term: Photometric, max_pixels: int) -> tuple[PhotometricRows, Tensor]:
@@ -226,20 +251,22 @@ def _thinned(term: Photometric, max_pixels: int) -> tuple[PhotometricRows, Tenso
     sizes={
         "owner": 0, "centre_cam": 0, "ray_cam": 1, "along_ray": 2, "along_baseline": 1, "intensity_left": 1,
         "pixel_weight": 0, "neighbour_weight": 1, "pixels": 0, "frame": 0, "to_full": 0, "crop": 0, "in_front": 0,
-        "covering": 0, "depth": 1, "on_surface": 1, "per_px": 0, "offsets_px": 0,
+        "covering": 0, "parts": 1, "depth": 1, "on_surface": 1, "per_px": 0, "offsets_px": 0,
     }
 )  # fmt: skip
 def shifted_costs(
     rows: PhotometricRows,
     config: PhotometricConfig,
+    parts: Tensor,  # (Q, B, R) which pixels count in each of Q costs, 0 or 1
     depth: Tensor,  # (S, B, R) of S surfaces, metres
     on_surface: Tensor,  # (S, B, R) bool
     per_px: Tensor,  # (B,) inverse depth that a pixel of disparity is worth
     offsets_px: Tensor,  # (n,)
 ) -> Tensor:
-    """Costs (S, n, B), float64, of a row of pixels of each car, with the surfaces moved by offsets of the disparity."""
+    """Costs (Q, S, n, B), float64, of parts of a row of pixels of each car, with surfaces moved by disparities."""
     inverse = 1 / depth[:, None] + offsets_px[:, None, None] * per_px[:, None]
     residual, comparable = residuals_at(rows, config, 1 / inverse)
     usable = on_surface[:, None] & comparable & (inverse > 0)
     rho = photometric_norm(config, torch.where(usable[..., None], residual, config.lost_grey_levels)).rho
-    return (rho * (rows.pixel_weight[..., None] * rows.neighbour_weight.movedim(0, -1))).sum((-1, -2)).to(torch.float64)
+    cost = (rho * (rows.pixel_weight[..., None] * rows.neighbour_weight.movedim(0, -1))).sum(-1)
+    return torch.stack([(cost * part).sum(-1) for part in parts.unbind()]).to(torch.float64)

@@ -8,7 +8,7 @@ where the images have it, a LiDAR box stays. Derivation: docs/derivations/fusion
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 from torch import Tensor
@@ -16,24 +16,18 @@ from torch import Tensor
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import rotation_y_from_pose, viewing_axes
 from directshape_torch.numerics.records import CarRecord, Dense
-from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.refinement.observability import HEADING_LEVER_M, quantities_jacobian
-from directshape_torch.terms.cars import CarState, retract
+from directshape_torch.refinement.trust import ImageNoise, probabilities
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.shape.zero_level import zero_level_extents
+from directshape_torch.terms.cars import CarBatch, CarState, retract
 
 if TYPE_CHECKING:
     from directshape_torch.refinement.result import RefinementResult
     from directshape_torch.scene import Detections
 
-
-class ImageNoise(NamedTuple):
-    """What images are off by in `CAR_QUANTITIES`: `sqrt((factor * sigma)^2 + floor^2)`, sigma uncalibrated."""
-
-    factors: tuple[float, ...]  # 7
-    floors_m: tuple[float, ...]  # 7
-
-
-IMAGE_NOISE = ImageNoise((0.47, 0.0, 0.18, 2.16, 1.17, 0.34, 0.10), (0.136, 0.076, 0.060, 0.042, 0.219, 0.076, 0.053))
-"""Fitted to labels of KITTI: the row "without rendered" of scripts/calibrate_fusion.py."""
+UNKNOWN_DETECTOR = torch.tensor([0.0260, 0.1558, 0.0779, 0.2078, 0.70, 0.16, 0.16], dtype=torch.float64)
+"""What detectors are off by of which nothing is known: `rig.detector_noise.detector_sigmas` without results."""
 
 _RIDGE = 1e-9
 
@@ -42,82 +36,112 @@ _RIDGE = 1e-9
 class DetectorComparison(CarRecord):
     """Where B refined cars have their box and where the detector had it, columns `CAR_QUANTITIES`, metres.
 
-    There are NaN for cars that were not refined, and for those that share their shape with other views of a track.
+    There are NaN for cars that were not refined.
 
     Attributes:
         distance: (B,) of the images' box along the ground, metres.
-        difference: (B, 7) the detector's less the images'; headings modulo half a turn.
+        difference: (B, 7) the detector's less the images'; headings modulo half a turn. NaN too for views of a track.
         sigma_images: (B, 7) standard deviations of what the images say.
-        covariance: (B, 7, 7) of the returned box where both were brought together, else NaN.
+        gain: (B, 7, 7) the most probable box less the images' is `gain @ difference`; zeros where nobody knows what the
+            detector is off by.
+        covariance: (B, 7, 7) of the most probable box; for views of a track of the images' box, which is returned.
+        distance_in_sigmas: (B,) between both boxes, in the standard deviations of both; of seven quantities that are
+            as they should be it is about 2.6. NaN where nobody knows what the detector is off by.
     """
 
     distance: Annotated[Tensor, Dense("B")]
     difference: Annotated[Tensor, Dense("B", 7)]
     sigma_images: Annotated[Tensor, Dense("B", 7)]
+    gain: Annotated[Tensor, Dense("B", 7, 7)]
     covariance: Annotated[Tensor, Dense("B", 7, 7)]
-
-    def variances_xyz_yaw(
-        self,
-        location: Tensor,  # (B, 3) of the cars, for their viewing rays
-    ) -> Tensor:  # (B, 4)
-        """The variances of x, y, z (metres) and heading (radians) of boxes that were brought together, else NaN."""
-        # The quantities are depth and sideways position along the ground, and the height, which grows against y.
-        axes = viewing_axes(location.detach().to(self.covariance))
-        position = (axes.mT @ self.covariance[:, :3, :3] @ axes).diagonal(dim1=1, dim2=2)
-        return torch.cat([position, self.covariance[:, 3, 3:4] / HEADING_LEVER_M**2], dim=1)
+    distance_in_sigmas: Annotated[Tensor, Dense("B")]
 
 
-def fused(
-    result: RefinementResult,
-    detections: Detections,
-    detector_sigmas: Tensor | None,
-    image_noise: ImageNoise = IMAGE_NOISE,
-) -> RefinementResult:
-    """The result with the comparison of every refined car, and with the boxes that both sources give together.
+def noise_of_boxes(
+    sigmas: Tensor,  # (7,) of `RigEstimate.detector_sigmas`
+    T_cam_obj: Tensor,  # (B, 4, 4)
+) -> Tensor:  # (B, 7)
+    """Standard deviations of a detector's boxes in `CAR_QUANTITIES`, metres: that of the depth grows with distance."""
+    origin = T_cam_obj.detach()[:, :3, 3].double()
+    units = torch.ones(len(origin), len(sigmas), dtype=origin.dtype, device=origin.device)
+    units[:, 0] = torch.hypot(origin[:, 0], origin[:, 2])
+    return sigmas.to(origin) * units
 
-    Args:
-        result: of the images, B cars.
-        detections: of the same cars.
-        detector_sigmas: (7,) standard deviations of the detector in `CAR_QUANTITIES`: of the depth as a share of the
-            distance, the others in metres. None: nothing is known, and the images' boxes stay.
-        image_noise: what the images are off by.
-    """
-    known = result.refined & result.covariance.isfinite().flatten(1).all(dim=1) & (result.track_part < 0)
-    rows = known.nonzero()[:, 0]
-    if not result.has_shape or not len(rows):
-        return result
-    with torch.no_grad():
-        J = quantities_jacobian(result.prior, _state(result, rows))
-        factors, floors = (constant_like(x, J) for x in image_noise)
-        of_images = factors[:, None] * (J @ result.covariance[rows] @ J.mT) * factors + torch.diag(floors**2)
-    difference, origin = _difference(result, rows, detections), result.T_cam_obj.detach()[rows, :3, 3].to(J)
-    distance, unknown = torch.hypot(origin[:, 0], origin[:, 2]), torch.full_like(of_images, torch.nan)
-    sigma_images = of_images.diagonal(dim1=1, dim2=2).sqrt()
-    comparison = DetectorComparison(distance, difference.detach(), sigma_images, unknown)
-    if detector_sigmas is not None:
-        sigmas = detector_sigmas.to(origin).repeat(len(rows), 1)
-        # The depth's is a share of where the detector has the car.
-        at_detector = detections.T_cam_obj.detach()[rows, :3, 3].to(origin)
-        sigmas[:, 0] = sigmas[:, 0] * torch.hypot(at_detector[:, 0], at_detector[:, 2])
-        of_detector = torch.diag_embed(sigmas**2)
+
+def level_boxes(
+    prior: ShapePrior,
+    T: Tensor,  # (B, 4, 4) object to any frame
+    code: Tensor,  # (B, K)
+) -> tuple[Tensor, Tensor]:  # (B, 3), (B, 3)
+    """The middles of the bottom faces of the boxes about zero levels, in that frame, and height, width, length."""
+    lower, upper = zero_level_extents(prior.values(code), prior.origin, prior.spacing_m).unbind(1)
+    length, height, width = (upper - lower).unbind(-1)
+    middle = 0.5 * (lower + upper)
+    bottom_obj = torch.stack([middle[:, 0], upper[:, 1], middle[:, 2]], dim=-1)
+    return se3.transform(T, bottom_obj), torch.stack([height, width, length], dim=-1)
+
+
+@torch.no_grad()
+def compared(result: RefinementResult, cars: CarBatch, image_noise: ImageNoise) -> DetectorComparison:
+    """The boxes of the images of B refined cars beside those of their detector."""
+    origin = result.T_cam_obj[:, :3, 3].double()
+    J = quantities_jacobian(result.prior, _state(result))
+    of_images = image_noise.covariance(J @ result.covariance @ J.mT)
+    difference = _difference(result, cars.detector_T_cam_obj, cars.detector_hwl)
+    gain, distance_in_sigmas = torch.zeros_like(of_images), torch.full_like(origin[:, 0], torch.nan)
+    covariance = of_images
+    if cars.detector_noise is not None:
+        of_detector = torch.diag_embed(cars.detector_noise.to(of_images) ** 2)
+        of_both = of_images + of_detector
         # Both are symmetric, so that the gain is the transpose of what solves for the covariance.
-        gain = torch.linalg.solve_ex(of_images + of_detector, of_images)[0].mT
-        comparison = replace(comparison, covariance=gain @ of_detector)
-        result = _moved(result, rows, detections, J, (gain @ difference[..., None])[..., 0], difference)
-    return replace(result, comparison=result.comparison.put(rows, comparison))
+        gain = torch.linalg.solve_ex(of_both, of_images)[0].mT
+        weighed = torch.linalg.solve_ex(of_both, difference[:, :, None])[0]
+        distance_in_sigmas = (difference[:, None] @ weighed)[:, 0, 0].sqrt()
+        covariance = gain @ of_detector
+        covariance = 0.5 * (covariance + covariance.mT)
+    return DetectorComparison(
+        distance=torch.hypot(origin[:, 0], origin[:, 2]),
+        difference=difference,
+        sigma_images=of_images.diagonal(dim1=1, dim2=2).sqrt(),
+        gain=gain,
+        covariance=covariance,
+        distance_in_sigmas=distance_in_sigmas,
+    )
 
 
-def _moved(
-    result: RefinementResult, rows: Tensor, detections: Detections, J: Tensor, target: Tensor, difference: Tensor
-) -> RefinementResult:
-    """The result with the cars `rows` moved by a change (R, 7) of their quantities, towards the detector.
+@torch.no_grad()
+def chances(result: RefinementResult, comparison: DetectorComparison, brings_together: bool) -> tuple[Tensor, Tensor]:
+    """`trust.probabilities` of the boxes that will be returned: the most probable ones, or those of the images."""
+    axes = viewing_axes(result.T_cam_obj[:, :3, 3].double())
+    length = axes @ result.T_cam_obj[:, :3, :1].double()
+    moved = (comparison.gain @ comparison.difference[:, :, None])[:, :, 0]
+    returned = torch.zeros_like(moved) if brings_together else -moved
+    _, hwl = level_boxes(result.prior, result.T_cam_obj, result.code)
+    turned = torch.atan2(length[:, 1, 0], length[:, 0, 0])
+    return probabilities(returned, comparison.difference - moved, comparison.covariance, hwl, turned)
 
-    The first step is linear, which sizes in the code are not; the second one takes what is left.
+
+def fused(result: RefinementResult, detections: Detections) -> RefinementResult:
+    """The result with the boxes of the images and the detections moved to the most probable ones between them.
+
+    Views of a track stay: they have each other.
     """
-    first = retract(_state(result, rows), _least_step(J, target))
-    at = _at(result, rows, first)
-    left = target - (difference - _difference(at, rows, detections))
-    return _at(result, rows, retract(first, _least_step(J, left)))
+    gains = result.comparison.gain
+    known = gains.isfinite().flatten(1).all(dim=1) & gains.flatten(1).any(dim=1)
+    rows = (result.refined & known & (result.track_part < 0)).nonzero()[:, 0]
+    if not len(rows):
+        return result
+    own, boxes, gain = result.rows(rows), (detections.T_cam_obj[rows], detections.dimensions_hwl[rows]), gains[rows]
+    difference = _difference(own, *boxes)
+    with torch.no_grad():
+        J = quantities_jacobian(own.prior, _state(own))
+    # The first step is linear, which sizes in the code are not; the second one takes what is left.
+    target = (gain @ difference[..., None])[..., 0]
+    first = retract(_state(own), _least_step(J, target))
+    left = target - (difference - _difference(_at(own, first), *boxes))
+    moved = _at(own, retract(first, _least_step(J, left)))
+    T_cam_obj = result.T_cam_obj.index_copy(0, rows, moved.T_cam_obj)
+    return replace(result, T_cam_obj=T_cam_obj, code=result.code.index_copy(0, rows, moved.code))
 
 
 def _least_step(J: Tensor, change: Tensor) -> Tensor:
@@ -134,23 +158,21 @@ def _least_step(J: Tensor, change: Tensor) -> Tensor:
     return torch.cat([solved(J[:, :4, :6], change[:, :4]), solved(J[:, 4:, 6:], change[:, 4:])], dim=1)
 
 
-def _state(result: RefinementResult, rows: Tensor) -> CarState:
-    return CarState.of(se3.inverse(result.T_cam_obj[rows]), result.code[rows])
+def _state(result: RefinementResult) -> CarState:
+    return CarState.of(se3.inverse(result.T_cam_obj), result.code)
 
 
-def _at(result: RefinementResult, rows: Tensor, state: CarState) -> RefinementResult:
-    T_cam_obj = result.T_cam_obj.index_copy(0, rows, se3.inverse(state.T_obj_cam))
-    return replace(result, T_cam_obj=T_cam_obj, code=result.code.index_copy(0, rows, state.code))
+def _at(result: RefinementResult, state: CarState) -> RefinementResult:
+    return replace(result, T_cam_obj=se3.inverse(state.T_obj_cam), code=state.code)
 
 
-def _difference(result: RefinementResult, rows: Tensor, detections: Detections) -> Tensor:
-    """The boxes of the detector less those of the result, (R, 7) in `CAR_QUANTITIES`, float64."""
-    T_detector, boxes = detections.T_cam_obj[rows], result.rows(rows).to_boxes("kitti")
-    moved = T_detector[:, :3, 3] - boxes[:, :3]
-    axes = viewing_axes(result.T_cam_obj[rows, :3, 3].detach())
-    along, across, down = (axes @ moved[..., None])[..., 0].unbind(dim=1)
-    turned = rotation_y_from_pose(T_detector) - boxes[:, 6]
+def _difference(result: RefinementResult, T_detector: Tensor, hwl: Tensor) -> Tensor:
+    """The boxes of the detector less those of the result, (B, 7) in `CAR_QUANTITIES`, float64."""
+    bottom, own_hwl = level_boxes(result.prior, result.T_cam_obj, result.code)
+    axes = viewing_axes(result.T_cam_obj[:, :3, 3].detach())
+    along, across, down = (axes @ (T_detector[:, :3, 3] - bottom)[..., None])[..., 0].unbind(dim=1)
+    turned = rotation_y_from_pose(T_detector) - rotation_y_from_pose(result.T_cam_obj)
     # Modulo half a turn: what of a car is its front the detector says alone.
     heading = 0.5 * torch.atan2(torch.sin(2 * turned), torch.cos(2 * turned))
-    height, width, length = (detections.dimensions_hwl[rows] - boxes[:, 3:6]).unbind(dim=1)
+    height, width, length = (hwl - own_hwl).unbind(dim=1)
     return torch.stack([along, across, -down, HEADING_LEVER_M * heading, length, width, height], dim=1).double()

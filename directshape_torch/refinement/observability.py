@@ -115,21 +115,20 @@ def without_offset(information: Tensor, num_kept: int) -> Tensor:
 
 
 def covariance_xyz_yaw(
-    covariance: Tensor,  # (B, D, D) in the tangent of `retract`
-    T_obj_cam: Tensor,  # (B, 4, 4)
+    covariance: Tensor,  # (B, 7, 7) of `CAR_QUANTITIES`
+    location: Tensor,  # (B, 3) of the cars, for their viewing rays
 ) -> Tensor:
-    """Covariance (B, 4, 4) of the object origin (x, y, z) along the camera's (and reference frame's) axes and of
-    `rotation_y`: metres and radians.
+    """Covariance (B, 4, 4) of x, y, z along the camera's (and reference frame's) axes and of `rotation_y`: metres and
+    radians."""
+    # Along the ray and across it on the ground; the height grows against y.
+    J = torch.nn.functional.pad(_towards(location.to(covariance)).mT, (0, 1, 0, 1))
+    J[:, 3, 3] = 1 / HEADING_LEVER_M
+    return J @ covariance[:, :4, :4] @ J.mT
 
-    The origin moves by `-R_cam_obj v`; the rotation vector of the object in camera axes is `-R_cam_obj omega`, and
-    `rotation_y`, the heading of the object's x axis, turns with its component about the camera's y axis (exact for a
-    level car, to first order in its tilt otherwise).
-    """
-    R_cam_obj = T_obj_cam[:, :3, :3].transpose(1, 2).to(covariance.dtype)
-    J = covariance.new_zeros(len(covariance), 4, covariance.shape[-1])
-    J[:, :3, :3] = -R_cam_obj
-    J[:, 3, 3:6] = -R_cam_obj[:, 1]
-    return J @ covariance @ J.transpose(1, 2)
+
+def _towards(location: Tensor) -> Tensor:
+    """The directions (B, 3, 3), rows, in which depth, sideways position and height of cars grow."""
+    return viewing_axes(location) * constant_like((1.0, 1.0, -1.0), location)[:, None]
 
 
 def observability_of(prior: ShapePrior, state: CarState, seen: Tensor | None) -> Observability:
@@ -150,9 +149,7 @@ def quantities_jacobian(prior: ShapePrior, state: CarState) -> Tensor:
     T_cam_obj = se3.inverse(state.T_obj_cam).to(torch.float64)
     R_cam_obj = T_cam_obj[:, :3, :3]
     J_hwl_code = prior.dimensions_and_derivative(state.code).J_hwl_code.to(torch.float64)
-    # Height grows against the y axis.
-    towards = viewing_axes(T_cam_obj[:, :3, 3]) * constant_like((-1.0, -1.0, 1.0), T_cam_obj)[:, None]
-    J_position = torch.cat([towards @ R_cam_obj, torch.zeros_like(R_cam_obj)], dim=2)
+    J_position = torch.cat([-_towards(T_cam_obj[:, :3, 3]) @ R_cam_obj, torch.zeros_like(R_cam_obj)], dim=2)
     J_heading = torch.cat([torch.zeros_like(R_cam_obj[:, 1]), -HEADING_LEVER_M * R_cam_obj[:, 1]], dim=1)
     J_pose = torch.cat([J_position, J_heading[:, None]], dim=1)
     no_pose, no_code = J_pose.new_zeros(len(J_pose), 3, 6), J_pose.new_zeros(len(J_pose), 4, J_hwl_code.shape[2])

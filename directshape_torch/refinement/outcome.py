@@ -16,6 +16,7 @@ from directshape_torch.refinement.disparity_profile import (
     default_offsets,
     disparity_profile,
 )
+from directshape_torch.refinement.fusion import chances, compared
 from directshape_torch.refinement.observability import (
     covariance_of,
     covariance_xyz_yaw,
@@ -23,23 +24,20 @@ from directshape_torch.refinement.observability import (
     without_offset,
 )
 from directshape_torch.refinement.problem import CarProblem, CarStage
-from directshape_torch.refinement.quality import (
-    EVIDENCE_NAMES,
-    bundled_trust_model,
-    evidence_of_costs,
-    evidence_of_motion,
-    fit_quality,
-)
+from directshape_torch.refinement.quality import fit_quality
 from directshape_torch.refinement.result import RefinementResult
+from directshape_torch.refinement.trust import EVIDENCE_NAMES, bundled_trust_model
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.problem import where_rows
+from directshape_torch.solver.sharing import INDEPENDENT
 from directshape_torch.status import Status, is_refined
 from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.priors import RIG_WEIGHT
 from directshape_torch.terms.term import Evaluation, Figures
 
+_REFUSED = (Status.not_trusted, Status.mask_missed, Status.no_match, Status.depth_unknown, Status.no_car)
 # Nine in ten cars whose cost settled promise less than this share of it.
 _SETTLED_SHARE = 0.005
 # Of 2300 rendered cars one has less, and boxes at half or twice the true depth have 0.62 at most.
@@ -47,8 +45,10 @@ _LEAST_MASK_IOU = 0.65
 # Of these cars at least 0.68 of the pixels could be compared.
 _LEAST_MATCHED_SHARE = 0.1
 # The pixels of a car that is there have their best disparity where it ended, and know it to this many pixels. Most
-# boxes and masks that are laid on other images fail in this (scripts/calibrate_fusion.py, column "elsewhere").
+# boxes and masks that are laid on other images fail in this (scripts/calibrate_trust.py, column "elsewhere").
 _LARGEST_OFFSET_SIGMA_PX = 0.5
+# Below it the mask rather shows another car or none than this one.
+_LEAST_IS_THERE = 0.5
 # Sigma along the viewing ray over the depth; of these cars at most 0.1.
 _LARGEST_DEPTH_SHARE = 0.2
 
@@ -106,7 +106,7 @@ def going_on(result: RefinementResult, rows: Tensor, later: RefinementResult) ->
 def at_states(result: RefinementResult, state: CarState) -> RefinementResult:
     """The result at its final states; what is said of a car that is not there is not known."""
     status, refined = result.status_code, result.refined
-    figures_known = refined | (status == Status.not_trusted.code) | (status == Status.no_evidence.code)
+    figures_known = refined | torch.stack([status == each.code for each in _REFUSED]).any(dim=0)
     # The input pose is returned to the bit for cars that were not refined, not inverted twice.
     T_cam_obj = torch.where(refined[:, None, None], se3.inverse(state.T_obj_cam), result.T_cam_obj)
     return replace(
@@ -118,11 +118,15 @@ def at_states(result: RefinementResult, state: CarState) -> RefinementResult:
         quality=result.quality.where(figures_known),
         observability=result.observability.where(refined),
         profile=result.profile.where(figures_known),
+        comparison=replace(
+            result.comparison.where(refined),
+            distance_in_sigmas=kept(result.comparison.distance_in_sigmas, figures_known),
+        ),
     )
 
 
 def outcome_of(
-    problem: CarProblem, initial: CarState, minimum: Minimum[CarState], cars: CarBatch, came: RefinementResult
+    problem: CarProblem, minimum: Minimum[CarState], cars: CarBatch, came: RefinementResult
 ) -> RefinementResult:
     """What `came` becomes at a minimum: costs, covariance, quality, observability and profile.
 
@@ -150,14 +154,42 @@ def outcome_of(
         cost_before=before.term_costs,
         cost_after=torch.where(refined[:, None], after.term_costs, before.term_costs),
         covariance=covariance,
-        covariance_xyz_yaw=covariance_xyz_yaw(covariance, end.T_obj_cam),
         # The directions are mostly those of the depth, so its factor brings them to size.
-        observability=replace(unseen, sigmas_m=bundled_trust_model().sigma_factors[0] * unseen.sigmas_m),
+        observability=replace(unseen, sigmas_m=_depth_factor() * unseen.sigmas_m),
         profile=disparity_profile(stage.photometric, at_input, at_end, len(cars), end.code),
     )
-    evidence = evidence_of_motion(problem, cars, initial, end, covariance, found.covariance_xyz_yaw)
-    evidence |= evidence_of_costs(found.cost_before, found.cost_after, found.profile)
-    return replace(found, quality=fit_quality(stage, after, minimum.seen_end, evidence))
+    of_images = _at_end(found, end)
+    comparison = compared(of_images, cars, bundled_trust_model().image_noise)
+    # Views of a track are not brought together with their detections.
+    chance = chances(of_images, comparison, brings_together=problem.sharing is INDEPENDENT)
+    apart, distance = found.profile.halves_apart, comparison.distance_in_sigmas
+    quality = fit_quality(stage, after, minimum.seen_end, apart, distance, chance)
+    return _placed(replace(found, comparison=comparison, quality=quality), end)
+
+
+def of_views_of_tracks(found: RefinementResult, end: CarState, cars: CarBatch) -> RefinementResult:
+    """The result of views of a track with what is known of the images' boxes, which they keep."""
+    alone = compared(_at_end(found, end), replace(cars, detector_noise=None), bundled_trust_model().image_noise)
+    # What the detector is off by is learnt from cars that are by themselves.
+    nothing, distance = torch.full_like(alone.difference, torch.nan), found.comparison.distance_in_sigmas
+    return _placed(replace(found, comparison=replace(alone, difference=nothing, distance_in_sigmas=distance)), end)
+
+
+def _placed(found: RefinementResult, end: CarState) -> RefinementResult:
+    """The result with the covariance of place and heading that follows from its comparison."""
+    location = se3.inverse(end.T_obj_cam)[:, :3, 3]
+    return replace(found, covariance_xyz_yaw=covariance_xyz_yaw(found.comparison.covariance, location))
+
+
+def _at_end(found: RefinementResult, end: CarState) -> RefinementResult:
+    """The result with every car where its iterations ended, refined or not."""
+    status = torch.full_like(found.status_code, Status.converged.code)
+    return replace(found, T_cam_obj=se3.inverse(end.T_obj_cam), code=end.code, status_code=status)
+
+
+def _depth_factor() -> float:
+    """What brings the uncalibrated standard deviations of the depth to size."""
+    return bundled_trust_model().image_noise.factors[0]
 
 
 def _of_field(end: CarState, cars: CarBatch) -> Tensor:
@@ -176,7 +208,7 @@ def _of_calibrated_rig(problem: CarProblem, figures: Figures) -> Figures:
     if not problem.num_offsets:
         return figures
     factor = torch.ones_like(figures.term_costs)
-    factor[:, problem.term_names.index("rig")] = bundled_trust_model().sigma_factors[0] ** 2 / RIG_WEIGHT
+    factor[:, problem.term_names.index("rig")] = _depth_factor() ** 2 / RIG_WEIGHT
     return figures._replace(information=figures.information * factor[..., None, None])
 
 
@@ -191,15 +223,18 @@ def judged(
     # The iterations may run out where there is nothing left to gain.
     settled = (status == Status.max_iterations.code) & (promised_decrease(minimum) < _SETTLED_SHARE)
     status = torch.where(settled, Status.converged.code, status)
-    unseen = is_refined(status) & ~has_evidence(minimum.end, found)
-    status = torch.where(unseen, Status.no_evidence.code, status)
+    refusal = refusal_of(found)
+    unseen = is_refined(status) & (refusal >= 0)
+    status = torch.where(unseen, refusal, status)
     # What the model of trust has learnt does not hold where there is nothing to see.
     better, not_worse = (
         probability.masked_fill(unseen, torch.nan)
         for probability in (found.quality.probability_better, found.quality.probability_not_worse)
     )
     doubtful, risky = better < limits.min_probability_better, not_worse < limits.min_probability_not_worse
-    status = torch.where(is_refined(status) & (doubtful | risky), Status.not_trusted.code, status)
+    is_there = bundled_trust_model().car_is_there(found.quality.evidence)
+    reason = torch.where(is_there < _LEAST_IS_THERE, Status.no_car.code, Status.not_trusted.code)
+    status = torch.where(is_refined(status) & (doubtful | risky), reason, status)
     state = where_rows(is_refined(status), minimum.state, initial)
     quality = replace(found.quality, probability_better=better, probability_not_worse=not_worse)
     return replace(minimum, state=state, status=status), replace(found, status_code=status, quality=quality)
@@ -216,27 +251,20 @@ def promised_decrease(minimum: Minimum[CarState]) -> Tensor:
     return torch.where(solvable, promised, torch.inf)
 
 
-def has_evidence(end: CarState, found: RefinementResult) -> Tensor:
-    """Whether the images confirm the states (B,) at the end: masks, compared pixels that match there, a known depth."""
-    quality, location = found.quality, se3.inverse(end.T_obj_cam)[:, :3, 3]
+def refusal_of(found: RefinementResult) -> Tensor:
+    """The status (B,) of states that the images do not confirm, else -1: masks, pixels that match, a known depth."""
+    quality, status = found.quality, torch.full_like(found.status_code, -1)
+    depth_share = found.comparison.sigma_images[:, 0] / found.comparison.distance
+    # Comparisons with NaN are false.
+    status = status.masked_fill(~(depth_share < _LARGEST_DEPTH_SHARE), Status.depth_unknown.code)
     left = quality.mask_iou_left
-    iou = torch.where(left.isnan(), quality.mask_iou_right, left)
-    depth_share = _sigma_along(found.covariance_xyz_yaw, location) / location[:, 2]
-    seen = depth_share < _LARGEST_DEPTH_SHARE  # a comparison with NaN is false
-    if "silhouette_left" in found.term_names:
-        seen = seen & (iou >= _LEAST_MASK_IOU)
     if "photometric" in found.term_names:
-        # Its pixels are those of the left mask.
         at_end = found.profile.after
         is_there = (at_end.offset_px.abs() < APART_PX) & (at_end.sigma_px < _LARGEST_OFFSET_SIGMA_PX)
-        seen = seen & (((quality.matched_share >= _LEAST_MATCHED_SHARE) & is_there) | left.isnan())
-    return seen
-
-
-def _sigma_along(covariance_xyz_yaw: Tensor, location: Tensor) -> Tensor:
-    """Calibrated standard deviation (B,) along the viewing rays."""
-    C = bundled_trust_model().calibrated_covariance(covariance_xyz_yaw, location)[:, :3, :3]
-    ray = location.to(C)
-    ray = ray / ray.norm(dim=1, keepdim=True)
-    variance: Tensor = (ray[:, None] @ C @ ray[..., None])[:, 0, 0]
-    return variance.sqrt()
+        # Its pixels are those of the left mask.
+        seen = ((quality.matched_share >= _LEAST_MATCHED_SHARE) & is_there) | left.isnan()
+        status = status.masked_fill(~seen, Status.no_match.code)
+    if "silhouette_left" in found.term_names:
+        iou = torch.where(left.isnan(), quality.mask_iou_right, left)
+        status = status.masked_fill(~(iou >= _LEAST_MASK_IOU), Status.mask_missed.code)
+    return status

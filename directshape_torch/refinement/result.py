@@ -23,12 +23,12 @@ from directshape_torch.numerics.conversion import working_dtype
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.records import CarRecord, Dense
 from directshape_torch.refinement.disparity_profile import DisparityProfile
-from directshape_torch.refinement.fusion import DetectorComparison
+from directshape_torch.refinement.fusion import DetectorComparison, level_boxes
 from directshape_torch.refinement.observability import Observability
-from directshape_torch.refinement.quality import FitQuality, bundled_trust_model
+from directshape_torch.refinement.quality import FitQuality
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.shape.zero_level import sdf_to_mesh, zero_level_extents
+from directshape_torch.shape.zero_level import sdf_to_mesh
 from directshape_torch.status import Status, counted, is_refined
 
 if TYPE_CHECKING:
@@ -76,8 +76,8 @@ class RefinementResult(CarRecord):
             that were not refined at all. Those of `not_trusted` cars are of the refinement that was not returned.
         covariance: (B, 6 + K, 6 + K) in the tangent `(v, omega, dcode)` of the object frame; uncalibrated (relative).
             NaN for cars that were not refined.
-        covariance_xyz_yaw: (B, 4, 4) of the object origin (x, y, z) in the reference frame and the heading, relative
-            too; `sigma_xyz_yaw` is calibrated.
+        covariance_xyz_yaw: (B, 4, 4) of the returned box's place (x, y, z) in the reference frame and of its heading,
+            in true units: metres and radians; see `sigma_xyz_yaw`.
         cost_history: (B, n) cost after each iteration, NaN where a car took no part; not comparable across
             stages, each of which begins when the slowest car of the batch has ended the one before.
         quality: agreement of each refined car with masks and images.
@@ -85,7 +85,7 @@ class RefinementResult(CarRecord):
         profile: photometric cost over the disparity at input and end; of `not_trusted` cars at the end that was not
             returned.
         comparison: how far the images' box of each refined car and the detector's lie apart, and what is known of the
-            box that both give together; NaN from a refiner without a rig.
+            box that both give together.
         input_dimensions_hwl: (B, 3) of the detections, metres.
         ground_source: where the ground plane of each car's frame came from, B entries.
         t_cam_ref: (B, 3) `x_cam = x_ref + t_cam_ref`.
@@ -102,8 +102,8 @@ class RefinementResult(CarRecord):
         >>> inputs = open_dataset("kitti", demo, demo / "detections" / "noisy_stereo", demo / "training" / "masks")
         >>> frame = inputs.load("000000")
         >>> result = ds.DirectShapeRefiner(config=ds.load_config("fast"))(frame.frame, frame.detections)
-        >>> len(result), len(result[0]), len(result[result.refined])
-        (6, 1, 6)
+        >>> len(result), len(result[0]), len(result[:3])
+        (6, 1, 3)
         >>> result.to_boxes("opencv").shape, result.corners().shape
         (torch.Size([6, 7]), torch.Size([6, 8, 3]))
     """
@@ -298,30 +298,21 @@ class RefinementResult(CarRecord):
         T = self.T_ref_obj if frame == "ref" else self.T_cam_obj
         # A car whose shape was not refined keeps the detector's box, not one of the mean shape.
         rows = (self.refined & self.has_shape).nonzero()[:, 0]
-        values = self.prior.values(self.code[rows])
-        lower, upper = zero_level_extents(values, self.prior.origin, self.prior.spacing_m).unbind(1)
-        length, height, width = (upper - lower).unbind(-1)
-        middle = 0.5 * (lower + upper)
-        bottom_obj = torch.stack([middle[:, 0], upper[:, 1], middle[:, 2]], dim=-1)
-        hwl = torch.stack([height, width, length], dim=-1)
+        bottom, hwl = level_boxes(self.prior, T[rows], self.code[rows])
         dimensions = self.input_dimensions_hwl.index_copy(0, rows, hwl)
-        location = T[:, :3, 3].index_copy(0, rows, se3.transform(T[rows], bottom_obj))
+        location = T[:, :3, 3].index_copy(0, rows, bottom)
         return se3.from_rotation_translation(T[:, :3, :3], location), dimensions
 
     @property
     def sigma_xyz_yaw(self) -> Tensor:
         """Standard deviations (B, 4) of the box's place in `ref` and of its heading, metres and radians.
 
-        They are NaN for cars that were not refined. Those of boxes of the images alone are calibrated with the default
-        settings on rendered frames; those of boxes that were brought together with the detector's are scales of
-        Student's t of 4 degrees of freedom, fitted on KITTI. A rig's own disparity error is in them as far as the
-        covariance of its field, `rig.disparity_sigma_px` or `Detections.offset_sigma_px` says.
+        They are NaN for cars that were not refined, and for boxes that were moved alone. They are scales of Student's t
+        of 4 degrees of freedom, fitted to cars with labels (docs/results.md), within which 63 % of the errors lie. A
+        rig's own disparity error is in them as far as the covariance of its field, `rig.disparity_sigma_px` or
+        `Detections.offset_sigma_px` says.
         """
-        location = self.T_cam_obj[:, :3, 3]
-        of_images = bundled_trust_model().calibrated_covariance(self.covariance_xyz_yaw, location)
-        variances = of_images.diagonal(dim1=1, dim2=2)
-        of_both = self.comparison.variances_xyz_yaw(location)
-        return torch.where(of_both.isfinite(), of_both, variances).sqrt()
+        return self.covariance_xyz_yaw.diagonal(dim1=1, dim2=2).sqrt()
 
     @full_precision()
     def mesh(self, index: int) -> trimesh.Trimesh:

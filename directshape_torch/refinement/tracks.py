@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.refinement.one_car import SaidOfShape, cut_once, own_and_shared, parts_by_shape, unlikeness
-from directshape_torch.refinement.outcome import at_states, going_on, judged, outcome_of
+from directshape_torch.refinement.outcome import at_states, going_on, judged, of_views_of_tracks, outcome_of
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.solver.differentiate import implicit_state, unrolled_state
@@ -85,13 +85,9 @@ def refined(
     # A track's steps depend on all of its views, trusted or not.
     of_all = _at_ends(in_track, torch.ones_like(rows, dtype=torch.bool))
     of_views = _attached(shared.problem, views, shared.agreed(take_rows(alone, rows)), of_all)
-    own = found.rows(rows)
-    of_track = replace(
-        of_track,
-        track_part=shared.part_of(in_track.status),
-        covariance=torch.lerp(of_track.covariance, own.covariance, _IN_COMMON),
-        covariance_xyz_yaw=torch.lerp(of_track.covariance_xyz_yaw, own.covariance_xyz_yaw, _IN_COMMON),
-    )
+    in_common = torch.lerp(of_track.covariance, found.covariance[rows], _IN_COMMON)
+    of_track = replace(of_track, track_part=shared.part_of(in_track.status), covariance=in_common)
+    of_track = of_views_of_tracks(of_track, in_track.end, views)
     found = going_on(found, rows[chosen], of_track.rows(chosen))
     # Path and neighbours have done their work.
     of_views = of_views._replace(path=of_views.path[:, :0], T_obj_next=of_views.T_obj_next[:, :0])
@@ -105,7 +101,7 @@ def _judged(
     record = torch.is_grad_enabled() and problem.config.backward.mode == "unroll"
     with torch.no_grad():
         minimum = minimise(problem, initial, problem.config.solver, start, record)
-        found = outcome_of(problem, initial, minimum, cars, came)
+        found = outcome_of(problem, minimum, cars, came)
         return judged(minimum, initial, found, problem.config.acceptance)
 
 

@@ -53,7 +53,9 @@ def _row(frame: int, result: FrameResult, car: int) -> CarRow:
         "cost_after": known(shapes.costs_after[car].sum()),
         "mask_iou": ious[0] if ious[0] is not None else ious[1],  # of the left mask, else of the right one
         "photometric_error_grey": known(shapes.photometric_errors_grey[car], 2),  # mean, 0..255
-        "probability_better": known(shapes.probabilities_better[car]),  # calibrated, as the next
+        "probability_better": known(shapes.probabilities_better[car]),  # calibrated, as the next two
+        "probability_not_worse": known(shapes.probabilities_not_worse[car]),
+        "distance_in_sigmas": known(shapes.distances_in_sigmas[car], 2),  # between the boxes of images and detector
         "sigma_depth_m": known(shapes.sigmas_ref[car, 2]),
         "iterations": int(shapes.iterations[car]),
         **{name: known(value, 3) for name, value in sizes},
@@ -81,7 +83,7 @@ def _judged(
 def car_gains(rows: Sequence[CarRow]) -> list[tuple[float, int]]:
     """How much better each car became, and the number of its frame, worst first.
 
-    By the overlap with the label where the run has labels, else by the probability to be better; the two cannot be
+    By the overlap with the label where the run has labels, else by the probability to be not worse; the two cannot be
     compared. Cars that were not refined have none. The page's `highlights.js` ranks by the same rule.
     """
     refined = [row for row in rows if row["refined"]]
@@ -89,7 +91,8 @@ def car_gains(rows: Sequence[CarRow]) -> list[tuple[float, int]]:
     by_labels = [(after - before, f) for before, after, f in judged if before is not None and after is not None]
     if any(row["iou_before"] is not None for row in rows):
         return sorted(by_labels)
-    return sorted((row["probability_better"], row["frame"]) for row in refined if row["probability_better"] is not None)
+    chances = [(row["probability_not_worse"], row["frame"]) for row in refined]
+    return sorted((chance, frame) for chance, frame in chances if chance is not None)
 
 
 def choose_frames(rows: Sequence[CarRow], num_frames: int, most: int) -> list[int]:

@@ -12,6 +12,7 @@ from typing import Any
 
 from directshape_torch.batch.run_log import read_log
 from directshape_torch.batch.run_status import read_status
+from directshape_torch.batch.verdict import verdict
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.comparison import WORSE_BY_BEV_IOU
 from directshape_torch.files.atomic_files import replaced_file
@@ -21,6 +22,7 @@ from directshape_torch.io.run_manifest import flatten, hash_fields
 from directshape_torch.report.car_rows import CarRow, car_rows, choose_frames
 from directshape_torch.report.frame_details import frame_details
 from directshape_torch.report.page_parts import data_block, data_url, mesh_data, page_frame
+from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, load_rigs
 from directshape_torch.status import Status
 from directshape_torch.visualize.run_frames import RunFrame, RunInputs
@@ -117,6 +119,7 @@ def _run_facts(
 ) -> dict[str, Any]:
     """The top of the page as JSON: counts, settings, mean errors, and what the reader should know about the page."""
     manifest = run.manifest
+    entries = {name: entry for name, entry in manifest.frames.items() if name in run.frame_ids}
     return {
         "name": run.path.resolve().name,
         "package_version": manifest.package_version,
@@ -130,19 +133,24 @@ def _run_facts(
         "settings": {name: str(value) for name, value in sorted(flatten(manifest.config).items())},
         "errors": _mean_errors(rows),
         "notes": list(notes),
+        "verdict": verdict(entries, _rigs(run)),
         "rig": _rig(run),
     }
 
 
 def _rig(run: RunFolder) -> dict[str, Any] | None:
     """What the run estimated of its rigs, in words and as a picture; None where it did not."""
-    words, picture, wanted = run.path / RIG_FILE, run.path / RIG_PICTURE, run.manifest.sha256["stereo_bias"]
-    if wanted is None or not words.is_file():
-        return None
-    rigs = load_rigs(words)
-    if hash_fields([rig.field for rig in rigs]) != wanted:  # an earlier run's
+    rigs, picture = _rigs(run), run.path / RIG_PICTURE
+    if not rigs:
         return None
     return {"words": [str(rig) for rig in rigs], "picture": data_url(read_rgb(picture)) if picture.is_file() else None}
+
+
+def _rigs(run: RunFolder) -> list[RigEstimate]:
+    """The rigs of the run's folder, unless they are an earlier run's."""
+    words, wanted = run.path / RIG_FILE, run.manifest.sha256["stereo_bias"]
+    rigs = load_rigs(words) if wanted is not None and words.is_file() else []
+    return rigs if rigs and hash_fields([rig.field for rig in rigs]) == wanted else []
 
 
 def _statuses(rows: Sequence[CarRow]) -> list[dict[str, Any]]:

@@ -120,6 +120,9 @@ class CarBatch(Record):
     track_id: Tensor | None  # (B,) see `Detections`, or None
     time_s: Tensor | None = None  # (B,) of each car's frame, see `FrameBatch`, or None
     T_world_cam: Tensor | None = None  # (B, 4, 4) likewise
+    # (B, 7) standard deviations of the detector's boxes in `CAR_QUANTITIES`, metres, with which results are brought
+    # together; None where they are not
+    detector_noise: Tensor | None = None
 
     @classmethod
     def from_scene(cls, frames: FrameBatch, detections: Detections, disparity_sigma_px: float = 0.0) -> CarBatch:

@@ -88,6 +88,8 @@ class RefinementTrace:
 def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections: Detections) -> RefinementTrace:
     """Refine some cars and keep every state on the way. Takes twice as long as the refinement; gradients are off.
 
+    The last state is where the images have each car; the result may lie between it and the detector's box.
+
     Raises:
         InputError: frames, detections and prior do not fit together; the method "box_alignment", which has no steps.
     """

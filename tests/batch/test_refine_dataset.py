@@ -27,7 +27,7 @@ from directshape_torch.shape.pca_prior import PCAShapePrior
 
 
 def test_cars_come_nearer_to_the_truth(shared_kitti: Path, tmp_path: Path) -> None:
-    summary = refine(shared_kitti, tmp_path, config=load_config(None, [EVERY_RESULT]))
+    summary = refine(shared_kitti, tmp_path, config=load_config(None, EVERY_RESULT))
     assert summary.exit_code == 0
     assert summary.num_cars == 2 * len(FRAMES)
     assert sum(summary.statuses.values()) == 2 * len(FRAMES)

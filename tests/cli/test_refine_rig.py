@@ -78,7 +78,9 @@ def test_frames_of_two_rigs_are_refined_in_one_run(
     assert "detector_sigmas" in capsys.readouterr().err
     field = load_rigs(tmp_path / "out" / "rig.json")[0].field
     save_field(replace(field, coefficients=field.coefficients + 0.5), tmp_path / "other.json")
-    assert main(command(source, tmp_path / "none", "--rig", str(tmp_path / "other.json"))) == 2
+    save_field(field, tmp_path / "field.json")
+    assert main(command(source, tmp_path / "by_field", "--rig", str(tmp_path / "field.json"))) == 1
+    assert main(command(source, tmp_path / "by_field", "--rig", str(tmp_path / "other.json"))) == 2
     assert "sha256 of 'stereo_bias'" in capsys.readouterr().err
 
 

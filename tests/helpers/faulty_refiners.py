@@ -19,8 +19,10 @@ from directshape_torch.scene import FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 # The model of trust does not know toys that have not converged.
-EVERY_RESULT = "acceptance.min_probability_better=0"
-FEW_STEPS = ("stages=[{contour_width_px: 0.5, image_level: 0, max_iterations: 2}]", EVERY_RESULT)
+EVERY_RESULT = ("acceptance.min_probability_better=0", "acceptance.min_probability_not_worse=0")
+# Cameras are exact, and what the images say is to be seen as it is.
+IMAGES_ALONE = ("rig.disparity_sigma_px=0", "priors.detector_weight=0")
+FEW_STEPS = ("stages=[{contour_width_px: 0.5, image_level: 0, max_iterations: 2}]", *EVERY_RESULT, *IMAGES_ALONE)
 
 
 def few_steps() -> RefinerConfig:

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from directshape_torch.config import AcceptanceConfig, RefinerConfig, StageConfig
+from directshape_torch.config import AcceptanceConfig, RefinerConfig, RigConfig, StageConfig
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
@@ -24,11 +24,14 @@ DEFAULT = replace(
     DEFAULT,
     # With 32 samples a ray that crosses opposite faces of the small grid never has one exactly on a plane of nodes.
     silhouette=replace(DEFAULT.silhouette, samples_per_ray=32),
-    priors=replace(DEFAULT.priors, dimensions_weight=1.0),
+    # What the solver finds is to be seen as it is.
+    priors=replace(DEFAULT.priors, dimensions_weight=1.0, detector_weight=0.0),
     # Of the few pixels that a toy covers evenly spaced ones leave out much of its contour.
     sampling=replace(DEFAULT.sampling, mode_right="adaptive"),
-    # The model of trust knows full-size images of real cars; what the solver finds on toys is to be seen as it is.
+    # The model of trust knows full-size images of real cars.
     acceptance=AcceptanceConfig(min_probability_better=0.0, min_probability_not_worse=0.0),
+    # Its cameras are exact.
+    rig=RigConfig(disparity_sigma_px=0.0),
 )
 MARCHED = replace(DEFAULT, solver=replace(DEFAULT.solver, rays="marched"))
 PAPER = replace(

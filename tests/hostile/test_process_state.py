@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers.faulty_refiners import EVERY_RESULT
 from helpers.quick_runs import dataset, refiner
 from helpers.synthetic_scene import cached_street
 
@@ -97,7 +98,10 @@ def write(_: Path, out: Path) -> None:
 def gradient(_: Path, __: Path) -> None:
     prior, street = cached_street()
     masks = street.detections.mask_left.dense().double().clone().requires_grad_()
-    config = load_config("fast", ["backward.mode=unroll", "acceptance.min_probability_better=0"])
+    config = load_config(
+        "fast",
+        ["backward.mode=unroll", *EVERY_RESULT],
+    )
     result = DirectShapeRefiner(prior, config)(street.frames, replace(street.detections, mask_left=masks))
     result.T_cam_obj.sum().backward()
 

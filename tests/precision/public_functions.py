@@ -354,7 +354,6 @@ CASES: dict[str, Case] = {
     "RigEstimate.offset_at": lambda n: estimate().offset_at(n.uv),
     "RigEstimate.corrected": lambda n: estimate().corrected(street()[0]).camera.disparity_field.bias(n.uv),
     "RigEstimate.informed": lambda _: tensors(estimate().informed(estimate().corrected(street()[0]), street()[1])),
-    "DisparityProfile.lowest": lambda _: result().profile.lowest,
     "DisparityProfile.cost_at": lambda _: result().profile.cost_at(0.5),
     "RigEstimate.add_rows": lambda _: with_rows(torch.full((1, 8), 7.3, dtype=torch.float32)).mean,
     "RigEstimate.learn": lambda _: learnt().results,

@@ -11,8 +11,8 @@ from helpers.problems import DEFAULT
 from helpers.synthetic_scene import cached_street, disturbed
 
 from directshape_torch.config import AcceptanceConfig, BackwardConfig, RefinerConfig, RigConfig
-from directshape_torch.refinement.quality import EVIDENCE_NAMES
 from directshape_torch.refinement.result import RefinementResult
+from directshape_torch.refinement.trust import EVIDENCE_NAMES
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections
 from directshape_torch.status import Status
@@ -39,8 +39,8 @@ def test_probabilities_and_evidence_come_with_every_refined_car() -> None:
     _, result = trusting()
     quality = result.quality
     assert quality.evidence.shape == (2, len(EVIDENCE_NAMES))
-    # Nobody said how well this detector knows its depths.
-    missing = EVIDENCE_NAMES.index("log_detector_sigma")
+    # Nobody said what this detector is off by.
+    missing = EVIDENCE_NAMES.index("log_detector_distance")
     assert quality.evidence.isfinite().sum(dim=0).tolist() == [
         0 if k == missing else 2 for k in range(len(EVIDENCE_NAMES))
     ]
@@ -134,7 +134,7 @@ def test_a_shape_that_misses_its_mask_is_not_returned_whatever_is_accepted(wrong
         T_cam_obj[0, 0, 3] += 4
     detections = replace(disturbed(scene.detections), T_cam_obj=T_cam_obj)
     result = refine(accepting(0.0), detections)
-    assert result.status[0] is Status.no_evidence
+    assert result.status[0] is Status.mask_missed
     assert result.quality.mask_iou_left[0] < 0.3
     assert torch.equal(result.T_cam_obj[0], T_cam_obj[0])
     assert result.quality.probability_not_worse[0].isnan()

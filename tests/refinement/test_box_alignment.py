@@ -91,7 +91,7 @@ def test_a_car_that_cannot_be_aligned_keeps_its_input_and_touches_no_other() -> 
     frames, detections = scene.frames, moved(scene.detections, 1.1, 0.9)
     healthy = aligned(frames, detections)
     grey = torch.full_like(frames.images_left, 0.5)
-    assert aligned(replace(frames, images_left=grey, images_right=grey), detections).status == [Status.no_evidence] * 2
+    assert aligned(replace(frames, images_left=grey, images_right=grey), detections).status == [Status.no_match] * 2
     # Not up to its contour, where the neighbourhoods of the other car's pixels end.
     inner = 1 - torch.nn.functional.max_pool2d(1 - detections.mask_left.dense()[1:], 9, 1, 4)
     spoilt = replace(frames, images_left=torch.where(inner > 0.5, torch.nan, frames.images_left))

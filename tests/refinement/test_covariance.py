@@ -6,13 +6,19 @@ from dataclasses import replace
 
 import torch
 from helpers.derivatives import central_differences, moved, tangent_of
+from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import DEFAULT, begun_stage, figures_at
 from helpers.synthetic_scene import Street, cached_street
 
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.refinement.observability import covariance_of, covariance_xyz_yaw, without_offset
+from directshape_torch.refinement.observability import (
+    covariance_of,
+    covariance_xyz_yaw,
+    quantities_jacobian,
+    without_offset,
+)
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -50,6 +56,7 @@ def test_weights_of_the_means_do_not_enter() -> None:
 
 def test_xyz_yaw_is_the_derivative_of_location_and_heading() -> None:
     T_cam_obj = pose_from_kitti(torch.tensor([2.0, 1.6, 15.0]).double(), torch.tensor(0.8).double())
+    prior = ellipsoid_prior()
     state = CarState.of(se3.inverse(T_cam_obj)[None], torch.zeros(1, 3).double())
 
     def xyz_yaw(delta: torch.Tensor) -> torch.Tensor:
@@ -58,9 +65,10 @@ def test_xyz_yaw_is_the_derivative_of_location_and_heading() -> None:
 
     J = central_differences(xyz_yaw, tangent_of(state))[:, 0]
     A = torch.randn(9, 9, dtype=torch.float64)
-    covariance = (A @ A.T)[None]
-    expected = J @ covariance[0] @ J.T
-    torch.testing.assert_close(covariance_xyz_yaw(covariance, state.T_obj_cam)[0], expected, rtol=1e-6, atol=1e-6)
+    covariance = A @ A.T
+    to_quantities = quantities_jacobian(prior, state)
+    found = covariance_xyz_yaw(to_quantities @ covariance @ to_quantities.mT, T_cam_obj[None, :3, 3])
+    torch.testing.assert_close(found[0], J @ covariance @ J.T, rtol=1e-6, atol=1e-6)
 
 
 def test_singular_and_broken_systems_give_nan() -> None:
@@ -110,4 +118,6 @@ def test_what_is_not_known_of_the_field_widens_depth_alone() -> None:
 def refined_covariance(prior: PCAShapePrior, scene: Street, field: DisparityField) -> torch.Tensor:
     """Uncalibrated covariance (B, 4, 4) of the street's cars, refined from where they are."""
     frames = replace(scene.frames, camera=replace(scene.frames.camera, disparity_field=field))
-    return DirectShapeRefiner(prior, DEFAULT)(frames, scene.detections).covariance_xyz_yaw
+    result = DirectShapeRefiner(prior, DEFAULT)(frames, scene.detections)
+    J = quantities_jacobian(prior, CarState.of(se3.inverse(result.T_cam_obj), result.code))
+    return covariance_xyz_yaw(J @ result.covariance @ J.mT, result.T_cam_obj[:, :3, 3])

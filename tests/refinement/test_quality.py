@@ -67,7 +67,7 @@ def test_photometric_agreement_is_the_mean_over_the_usable_pixels_car_by_car() -
     for at in (state, CarState.of(T, state.code)):
         rows = stage.photometric_part(figures_at(stage, at))
         assert rows is not None
-        error, share = photometric_agreement(term, rows)
+        error, share, _ = photometric_agreement(term, rows)
         for car in range(2):
             in_set = (fixed.rows.pixel_weight > 0) & (fixed.blocks.owner == car)[:, None]
             usable = in_set & rows.where.usable
@@ -97,7 +97,7 @@ def test_a_car_with_its_input_back_costs_after_what_it_cost_before() -> None:
     scene = cached_street()[1]
     frames, detections = scene.frames, disturbed(scene.detections)
     came = as_they_came(problem.prior, frames, detections, minimum.status, problem.term_names)
-    found = outcome_of(problem, initial, minimum, CarBatch.from_scene(frames, detections), came)
+    found = outcome_of(problem, minimum, CarBatch.from_scene(frames, detections), came)
     at_end, at_input = (figures_at(stage, state).term_costs for state in (end, initial))
     assert torch.equal(found.cost_before, at_input)
     assert torch.equal(found.cost_after, torch.stack([at_input[0], at_end[1]]))

@@ -28,9 +28,9 @@ def result(*cars: KittiObject, **changes: object) -> FrameResult:
 
 def test_what_is_not_known_is_none() -> None:
     unknown = np.full(2, np.nan)
-    rows = car_rows(0, result(car(1, 100), car(2, 300), mask_iou_left=unknown, probabilities_better=unknown))
+    rows = car_rows(0, result(car(1, 100), car(2, 300), mask_iou_left=unknown, probabilities_not_worse=unknown))
     assert rows[0]["mask_iou"] == 0.9
-    assert rows[0]["probability_better"] is None
+    assert rows[0]["probability_not_worse"] is None
     assert rows[0]["counts"] is None
     assert rows[0]["iou_after"] is None
     assert [row["refined"] for row in rows] == [True, False]
@@ -52,7 +52,7 @@ def row(frame: int, **changes: object) -> CarRow:
 def test_gains_are_of_one_kind() -> None:
     judged = row(0, iou_before=0.5, iou_after=0.8)
     assert car_gains([judged, row(1)]) == [(pytest.approx(0.3), 0)]
-    assert car_gains([row(4, probability_better=0.9), row(5, probability_better=0.2)]) == [(0.2, 5), (0.9, 4)]
+    assert car_gains([row(4, probability_not_worse=0.9), row(5, probability_not_worse=0.2)]) == [(0.2, 5), (0.9, 4)]
     assert car_gains([row(6, refined=False)]) == []
 
 
@@ -65,7 +65,7 @@ def test_frames_of_extremes_come_first() -> None:
 @settings(max_examples=50)
 @given(st.integers(0, 40), st.integers(0, 40))
 def test_as_many_frames_as_asked_for(num_frames: int, most: int) -> None:
-    rows = [row(frame, probability_better=0.5) for frame in range(0, num_frames, 3)]
+    rows = [row(frame, probability_not_worse=0.5) for frame in range(0, num_frames, 3)]
     chosen = choose_frames(rows, num_frames, most)
     assert chosen == sorted(set(chosen))
     assert len(chosen) == min(num_frames, most)

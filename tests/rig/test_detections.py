@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.faulty_refiners import EVERY_RESULT, IMAGES_ALONE
 from helpers.synthetic_scene import masked
 from torch import Tensor
 
@@ -121,7 +122,7 @@ def test_the_refiner_corrects_frames_by_its_rig(demo: LoadedFrame) -> None:
     corrected = rig.corrected(demo.frame)
     assert torch.equal(corrected.camera.disparity_field.coefficients, rig.field.coefficients)  # type: ignore[union-attr]
     assert rig.corrected(corrected) is corrected
-    config = directshape_torch.load_config("fast", ["stages=[{max_iterations: 1}]"])
+    config = directshape_torch.load_config("fast", ["stages=[{max_iterations: 1}]", *EVERY_RESULT, *IMAGES_ALONE])
     by_rig = DirectShapeRefiner(config=config, rig=rig)(demo.frame, demo.detections)
     by_camera = DirectShapeRefiner(config=config)(corrected, rig.informed(corrected, demo.detections))
     assert torch.equal(by_rig.T_cam_obj, by_camera.T_cam_obj)
@@ -140,11 +141,10 @@ def test_what_an_estimate_of_few_cars_says_gives_way_to_settings_and_methods(dem
     informed = rig.informed(frames, plain)
     for config, heard in (
         (["priors.pose_sigma_yaw_deg=1"], replace(informed, pose_sigma=None)),
-        (["rig.disparity_sigma_px=0.9"], replace(informed, offset_sigma_px=None)),
         # Its points know no offset: the covariance keeps what it owes to the field.
         (["method=geometric", "point_cloud.rounds=1"], replace(informed, offset_sigma_px=None)),
     ):
-        once = ["stages=[{max_iterations: 1}]", "acceptance.min_probability_better=0"]
+        once = ["stages=[{max_iterations: 1}]", *EVERY_RESULT]
         settings = directshape_torch.load_config("fast", [*once, *config])
         by_rig = DirectShapeRefiner(config=settings, rig=rig)(demo.frame, plain)
         expected, other = (DirectShapeRefiner(config=settings)(frames, d) for d in (heard, informed))

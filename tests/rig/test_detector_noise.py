@@ -9,6 +9,7 @@ from torch import Tensor
 
 from directshape_torch import RigEstimate
 from directshape_torch.errors import InputError
+from directshape_torch.refinement.fusion import UNKNOWN_DETECTOR
 from directshape_torch.rig.detector_noise import detector_sigmas, in_words
 from directshape_torch.rig.rigs import RigEstimates
 
@@ -48,7 +49,12 @@ def test_a_good_detector_is_told_from_a_guess_by_a_hundred_cars() -> None:
 
 def test_of_a_single_car_the_prior_decides_most() -> None:
     one = detector_sigmas(rows_of(LIDAR, 1))
-    assert ((one > 0.3 * SHOWN.reciprocal() * torch.tensor([0.02, 0.12, 0.06, 0.16, 0.35, 0.08, 0.08])).all()).item()
+    assert ((one > 0.2 * SHOWN.reciprocal() * torch.tensor([0.02, 0.12, 0.06, 0.16, 0.35, 0.08, 0.08])).all()).item()
+
+
+def test_without_results_a_detector_is_as_most_are() -> None:
+    nothing = detector_sigmas(torch.zeros(0, 15, dtype=torch.float64))
+    torch.testing.assert_close(nothing, UNKNOWN_DETECTOR, rtol=0.01, atol=0)
 
 
 def test_words_name_every_quantity_with_its_unit() -> None:

@@ -111,7 +111,12 @@ def test_the_refine_command_takes_every_kind(kind: str, tmp_path: Path) -> None:
     write_data_set(root, ("000000",))
     words = ["refine", "--data", root, "--detections", root / "detections", "--masks", root / "masks", "--out", out]
     options = ["--prior", write(kind, tmp_path), "--device", "cpu", "--meshes", "ply", "--overlays"]
-    settings = ["--set", "stages=[{max_iterations: 2}]", "acceptance.min_probability_better=0"]
+    settings = [
+        "--set",
+        "stages=[{max_iterations: 2}]",
+        "acceptance.min_probability_better=0",
+        "acceptance.min_probability_not_worse=0",
+    ]
     assert main([str(word) for word in (*words, *options, *settings)]) == 0
     shapes = read_shapes(out / "shapes" / "000000.npz")
     assert shapes.codes.shape == (2, prior_of(kind).num_codes)

@@ -37,6 +37,11 @@ def _with_field(frames: FrameBatch, value_px: float) -> FrameBatch:
     return replace(frames, camera=replace(camera, disparity_field=field))
 
 
+def _unsure(detections: Detections) -> Detections:
+    """The disparities of the cars may be off by a pixel, whatever field their frames have."""
+    return replace(detections, offset_sigma_px=torch.ones(len(detections), dtype=torch.float64))
+
+
 def _refine(config: RefinerConfig, frames: FrameBatch, detections: Detections) -> RefinementResult:
     result: RefinementResult = DirectShapeRefiner(ellipsoid_prior(), config)(frames, detections)
     return result
@@ -49,7 +54,7 @@ def test_an_offset_does_what_a_constant_field_does(level: int) -> None:
     for field_px, offset_px in ((0.3, 0.7), (1.0, 0.0)):
         frames = _with_field(scene.frames, field_px)
         stage, state = begun_stage(
-            ellipsoid_prior(), frames, disturbed(scene.detections, 0.05, 0.02), UNSURE, 1 - level
+            ellipsoid_prior(), frames, _unsure(disturbed(scene.detections, 0.05, 0.02)), DEFAULT, 1 - level
         )
         state = state._replace(offset_px=torch.full_like(state.offset_px, offset_px))
         stage = stage.problem.begin(stage.config, stage.problem.look(state))
@@ -88,14 +93,14 @@ def test_a_disparity_that_is_not_believed_gives_way_to_the_detectors_depth() -> 
     frames, given = _with_field(scene.frames, 1.0), scene.detections
     sigma = torch.tensor([0.05, 0.1, 0.1, 0.05], dtype=torch.float64).expand(2, 4)
     sure = _refine(DEFAULT, frames, given)
-    unsure = _refine(UNSURE, frames, replace(given, pose_sigma=sigma))
+    unsure = _refine(DEFAULT, frames, _unsure(replace(given, pose_sigma=sigma)))
     too_far, apart = ((result.T_cam_obj - given.T_cam_obj)[:, 2, 3] for result in (sure, unsure))
     assert (too_far > torch.tensor([0.6, 1.4])).all()
     assert (apart.abs() < 0.05).all()
     # Without a prior of the pose it is the size of the silhouettes that says so, and not as surely.
-    unsure = _refine(UNSURE, frames, given)
+    unsure = _refine(DEFAULT, frames, _unsure(given))
     assert ((unsure.T_cam_obj - given.T_cam_obj)[:, 2, 3].abs() < 0.15).all()
-    assert (unsure.sigma_xyz_yaw[:, 2] > 2 * sure.sigma_xyz_yaw[:, 2]).all()
+    assert (unsure.sigma_xyz_yaw[:, 2] > 1.2 * sure.sigma_xyz_yaw[:, 2]).all()
     assert (unsure.observability.sigmas_m[:, 0] > sure.observability.sigmas_m[:, 0]).all()
     assert unsure.covariance.shape == sure.covariance.shape == (2, 9, 9)
 

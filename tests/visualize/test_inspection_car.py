@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers.faulty_refiners import IMAGES_ALONE
 from helpers.synthetic_scene import masked
 
 from directshape_torch.cli.demo import demo_dataset
@@ -26,7 +27,7 @@ _CAR = 1
 def course() -> CarCourse:
     data = demo_dataset()
     loaded = data.load(data.frame_ids[0])
-    refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off"]))
+    refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off", *IMAGES_ALONE]))
     return CarCourse(loaded, trace_refinement(refiner, loaded.frame, loaded.detections), _CAR)
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from helpers.faulty_refiners import IMAGES_ALONE
 
 from directshape_torch.cli.demo import demo_dataset
 from directshape_torch.geometry import se3
@@ -33,7 +34,7 @@ def _with_lost_car(detections: Detections) -> Detections:
 
 @pytest.fixture(scope="module", params=[[], ["method=geometric"], [_SEARCH]], ids=["direct", "geometric", "search"])
 def trace(request: pytest.FixtureRequest, demo_frame: LoadedFrame) -> RefinementTrace:
-    refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off", *request.param]))
+    refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off", *IMAGES_ALONE, *request.param]))
     return trace_refinement(refiner, demo_frame.frame, _with_lost_car(demo_frame.detections))
 
 

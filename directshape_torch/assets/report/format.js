@@ -46,6 +46,6 @@ export function costChange(car) {
 // chosen_frames.py is the same rule.
 export function gain(car, byLabels) {
   if (!car.refined) return null;
-  if (!byLabels) return car.probability_better;
+  if (!byLabels) return car.probability_not_worse;
   return iouChange(car);
 }

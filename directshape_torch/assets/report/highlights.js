@@ -18,7 +18,7 @@ export function showHighlights() {
   }
   const rule = hasErrorsBefore
     ? "By the change of the bird's-eye IoU with the label, of the cars that the summary counts."
-    : "By the calibrated probability that the result is better than the input.";
+    : "By the calibrated probability that the result is not worse than the input.";
   const better = ranked.filter((car) => !hasErrorsBefore || value(car) > 0).length;
   const half = Math.min(COUNT, Math.ceil(ranked.length / 2));
   place.append(element("p", { class: "quiet" }, rule),
@@ -36,6 +36,6 @@ function cards(chosen, none) {
 function figures(car) {
   const words = car.iou_before !== null && car.iou_after !== null
     ? [`IoU ${change(car.iou_before, car.iou_after)} (${signed(iouChange(car))})`, tone(car.iou_before, car.iou_after, true)]
-    : [`probably better: ${percent(car.probability_better)}`, null];
+    : [`probably not worse: ${percent(car.probability_not_worse)}`, null];
   return element("span", {}, element("span", { class: words[1] }, words[0]), `, ${number(car.distance_m, 1)} m, ${car.status}`);
 }

@@ -9,7 +9,7 @@ export function showSummary() {
   byId("subtitle").textContent = `${counted(run.frames_done, "frame")}, ${counted(run.cars, "car")}, ${run.refined} refined`;
   byId("made-by").textContent =
     `Written by directshape_torch (results of version ${run.package_version}). 3D views by three.js, MIT licence.`;
-  byId("summary").append(...[tiles(), judged(), rig(), notes(), failures(), statuses(), settings()].filter((part) => part !== null));
+  byId("summary").append(...[tiles(), judged(), verdict(), rig(), notes(), failures(), statuses(), settings()].filter((part) => part !== null));
 }
 
 function tiles() {
@@ -53,6 +53,12 @@ function notes() {
   if (!run.notes.length) return null;
   return element("div", { class: "notice", id: "notes" }, element("strong", {}, "What this page lacks"),
     element("ul", {}, ...run.notes.map((note) => element("li", {}, note))));
+}
+
+function verdict() {
+  if (!run.verdict.length) return null;
+  return element("div", { class: "notice", id: "verdict" }, element("strong", {}, "What to think of this run, without labels"),
+    element("ul", {}, ...run.verdict.map((sentence) => element("li", {}, sentence))));
 }
 
 function rig() {

@@ -25,6 +25,7 @@ const columns = [
   ...(hasLabels ? [numeric("Centre error after [m]", (car) => car.centre_after_m, undefined, (car) => tone(car.centre_before_m, car.centre_after_m))] : []),
   numeric("Cost change", costChange, (car) => percent(costChange(car))),
   numeric("Probably better", (car) => car.probability_better, (car) => percent(car.probability_better)),
+  numeric("Probably not worse", (car) => car.probability_not_worse, (car) => percent(car.probability_not_worse)),
   numeric("Mask IoU", (car) => car.mask_iou),
   numeric("Image difference [grey]", (car) => car.photometric_error_grey, (car) => number(car.photometric_error_grey, 1)),
   numeric("Sigma of depth [m]", (car) => car.sigma_depth_m),

@@ -1,0 +1,187 @@
+"""Refined cars with labels, and boxes refined where no car is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from directshape_torch.config import AcceptanceConfig
+from directshape_torch.evaluation.matching import is_counted, match_to_labels
+from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
+from directshape_torch.geometry.box3d import pose_from_kitti
+from directshape_torch.geometry.image_boxes import box_iou
+from directshape_torch.io.config_files import load_config
+from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
+from directshape_torch.refinement.fusion import chances, compared, fused, noise_of_boxes
+from directshape_torch.refinement.result import RefinementResult
+from directshape_torch.refinement.trust import WORSE_BY, ImageNoise, LogisticHead
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.rig.detector_noise import detector_sigmas, rows_of
+from directshape_torch.rig.from_files import estimate_rigs
+from directshape_torch.rig.rigs import RigEstimates
+from directshape_torch.scene import Detections
+from directshape_torch.terms.cars import CarBatch
+
+Array = NDArray[np.float64]
+EVERYTHING = AcceptanceConfig(min_probability_better=0.0, min_probability_not_worse=0.0)
+# Neighbours in a drive show the same cars.
+_FRAMES_ON, _MOST_OVERLAP = (5, 7, 11), 0.3
+
+
+class Frame(NamedTuple):
+    """Cars of a frame that were refined, by the images alone."""
+
+    result: RefinementResult
+    detections: Detections
+    cars: CarBatch  # of them
+    boxes: tuple[Tensor, Tensor] | None  # (N, 7) of detections and labels in the frame of labels; None: no cars there
+
+
+class Judged(NamedTuple):
+    """N cars of a run as some image noise and some detector's standard deviations have them."""
+
+    before: Array  # (N,) overlap of the input with the label; NaN without a label
+    images: Array  # (N,) that of the images' box
+    after: Array  # (N,) that of the most probable box
+    evidence: Array  # (N, E)
+    chance: Array  # (N, 2) of a better and of a not worse box, where the car is there
+    standard: Array  # (N, 7) errors of the most probable box over their standard deviations
+
+
+@dataclass(frozen=True)
+class Cars:
+    """The refined cars of one run, and those of its boxes and masks on other images."""
+
+    root: str
+    detector: str
+    frames: list[Frame]
+    elsewhere: list[Frame]
+
+    def comparisons(self, noise: ImageNoise) -> Tensor:
+        """Rows (N, 15) of `rig.detector_noise`."""
+        return torch.cat([rows_of(compared(frame.result, frame.cars, noise)) for frame in self.frames])
+
+    def judged(self, noise: ImageNoise, elsewhere: bool = False) -> Judged:
+        """The cars as this image noise has them, with the detector's that the run learns by it."""
+        sigmas = detector_sigmas(self.comparisons(noise))
+        frames = self.elsewhere if elsewhere else self.frames
+        parts = [_judged(frame, noise, sigmas) for frame in frames]
+        return Judged(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _judged(frame: Frame, noise: ImageNoise, sigmas: Tensor) -> Judged:
+    result, cars = frame.result, replace(frame.cars, detector_noise=noise_of_boxes(sigmas, frame.detections.T_cam_obj))
+    comparison = compared(result, cars, noise)
+    chance = torch.stack(chances(result, comparison, brings_together=True), dim=1).numpy()
+    evidence = result.quality.evidence.clone()
+    evidence[:, 2] = (comparison.distance_in_sigmas**2 + 3).log()
+    together = fused(replace(result, comparison=comparison), frame.detections)
+    before = images = after = np.full(len(result), np.nan)
+    standard = np.full((len(result), 7), np.nan)
+    if frame.boxes is not None:
+        detector, truth = frame.boxes
+        own, both = (each.to_boxes("kitti", "ref").double() for each in (result, together))
+        before, images, after = (pose_errors(boxes, truth).bev_iou.numpy() for boxes in (detector, own, both))
+        of_truth = replace(
+            cars,
+            detector_T_cam_obj=_poses(truth, result.t_cam_ref).to(result.T_cam_obj),
+            detector_hwl=truth[:, 3:6].to(result.T_cam_obj),
+        )
+        error = compared(together, of_truth, noise).difference
+        standard = (error / comparison.covariance.diagonal(dim1=1, dim2=2).sqrt()).numpy()
+    return Judged(before, images, after, evidence.numpy(), chance, standard)
+
+
+def _poses(boxes: Tensor, t_cam_ref: Tensor) -> Tensor:
+    return pose_from_kitti(boxes[:, :3] + t_cam_ref.double(), boxes[:, 6])
+
+
+def errors_of_images(frame: Frame) -> tuple[Array, Array]:
+    """What labels say that the images' boxes are off by (N, 7), and their uncalibrated standard deviations."""
+    assert frame.boxes is not None
+    truth, like = frame.boxes[1], frame.result.T_cam_obj
+    of_truth = replace(
+        frame.cars,
+        detector_T_cam_obj=_poses(truth, frame.result.t_cam_ref).to(like),
+        detector_hwl=truth[:, 3:6].to(like),
+    )
+    found = compared(frame.result, of_truth, ImageNoise((1.0,) * 7, (0.0,) * 7))
+    return found.difference.numpy(), found.sigma_images.numpy()
+
+
+def refined_cars(
+    root: Path, detections: Path, masks: Path, detector: str, overrides: Sequence[str], with_elsewhere: bool
+) -> Cars:
+    """All cars of a run, whose rigs are estimated from its detections, every result returned."""
+    torch.set_num_threads(1)
+    dataset = open_dataset("kitti", root, detections, masks)
+    config = load_config(None, overrides)
+    # What the images say alone, which is brought together with the detections as this script sees it.
+    alone = replace(config.priors, detector_weight=0.0)
+    config = replace(config, acceptance=EVERYTHING, check="off", priors=alone)
+    refiner = DirectShapeRefiner(config=config, rig=RigEstimates(estimate_rigs(dataset)))
+    loaded = [dataset.load(frame_id) for frame_id in dataset.frame_ids]
+    frames = [frame for each in loaded for frame in _with_labels(refiner, each)]
+    elsewhere = _elsewhere(refiner, loaded) if with_elsewhere else []
+    return Cars(root.name, detector, frames, elsewhere)
+
+
+def _with_labels(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> list[Frame]:
+    if not len(loaded.detections):
+        return []
+    with torch.no_grad():
+        result = refiner(loaded.frame, loaded.detections)
+    found = match_to_labels(loaded.detected_objects, loaded.labels or [])
+    rows = [row for row, label in found.items() if result.refined[row] and is_counted(label)]
+    boxes = boxes_of([loaded.detected_objects[row] for row in rows]), boxes_of([found[row] for row in rows])
+    return [_frame(loaded, result, loaded.detections, rows, boxes)] if rows else []
+
+
+def _elsewhere(refiner: DirectShapeRefiner, loaded: Sequence[LoadedFrame]) -> list[Frame]:
+    """Boxes and masks on the images of other frames, where these have no labelled object like them."""
+    frames = []
+    pairs = [(each, loaded[(n + on) % len(loaded)]) for on in _FRAMES_ON for n, each in enumerate(loaded)]
+    for each, other in pairs:
+        same_size = other.frame.images_left.shape == each.frame.images_left.shape
+        if other is each or not same_size or not len(each.detections):
+            continue
+        with torch.no_grad():
+            result = refiner(other.frame, each.detections)
+        labels = [label for label in other.labels or [] if label.has_box_3d]
+        boxes, taken = (np.array([o.box_2d for o in x]).reshape(-1, 4) for x in (each.detected_objects, labels))
+        is_free = (box_iou(boxes, taken) < _MOST_OVERLAP).all(axis=1)
+        rows = [row for row in range(len(result)) if is_free[row] and result.refined[row]]
+        if rows:
+            frames.append(_frame(other, result, each.detections, rows, None))
+    return frames
+
+
+def _frame(
+    loaded: LoadedFrame,
+    result: RefinementResult,
+    detections: Detections,
+    rows: list[int],
+    boxes: tuple[Tensor, Tensor] | None,
+) -> Frame:
+    index = torch.tensor(rows, dtype=torch.long)
+    chosen = detections.rows(index)
+    return Frame(result.rows(index), chosen, CarBatch.from_scene(loaded.frame, chosen), boxes)
+
+
+def returned(judged: Judged, is_there: LogisticHead, limits: AcceptanceConfig) -> tuple[Array, NDArray[np.bool_]]:
+    """Probabilities (N, 2) with the chance that the car is there, and which boxes come back (N,)."""
+    probability = is_there(torch.from_numpy(judged.evidence)).numpy()[:, None] * judged.chance
+    least = limits.min_probability_better, limits.min_probability_not_worse
+    return probability, np.asarray((probability >= least).all(axis=1))
+
+
+def outcomes(judged: Judged) -> NDArray[np.bool_]:
+    """(N, 2) whether the most probable box is better than the input, and whether it is not worse."""
+    return np.stack([judged.after > judged.before, judged.after >= judged.before - WORSE_BY], axis=1)
