@@ -25,19 +25,19 @@ from pathlib import Path
 import numpy as np
 import torch
 from command_line import run_command
-from trust_calibration.cars import Array, Cars, Judged, outcomes, refined_cars, returned
+from trust_calibration.cars import Array, Cars, Judged, outcomes, probabilities, refined_cars, returned
 from trust_calibration.draws import SIMULATED, write_draws
 from trust_calibration.fit import fit_head, fit_noise
 
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.files.atomic_files import write_text
+from directshape_torch.io.config_files import load_config
 from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.refinement.observability import CAR_QUANTITIES
 from directshape_torch.refinement.trust import WORSE_BY, TrustModel, bundled_trust_model
 
 BINS = (0.0, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 _TO_SIGMA = 1 / 0.7407  # the median of |x| of Student's t of 4 degrees of freedom
-POLICY = AcceptanceConfig()
 
 
 def runs_of(args: argparse.Namespace) -> list[Cars]:
@@ -50,16 +50,17 @@ def runs_of(args: argparse.Namespace) -> list[Cars]:
         dataset = open_dataset("kitti", root, Path(root) / "training" / "label_2", masks)
         folders = [args.out / f"{Path(root).name}_{detections}_{seed}" for seed in range(args.draws)]
         write_draws(dataset, detections, folders)
-        wanted += [(Path(root), folder, Path(masks), detections, folder == folders[0]) for folder in folders]
-    refine = partial(_refined, overrides=tuple(args.set))
+        first = folders[0]
+        wanted += [(Path(root), folder, Path(masks), detections, folder == first) for folder in folders]
+    refine = partial(_refined, overrides=tuple(args.set), by_frame=args.by_frame)
     with ProcessPoolExecutor(args.workers, mp_context=get_context("spawn")) as pool:
         return [pickle.loads(content) for content in pool.map(refine, wanted)]
 
 
-def _refined(run: tuple[Path, Path, Path, str, bool], overrides: Sequence[str]) -> bytes:
+def _refined(run: tuple[Path, Path, Path, str, bool], overrides: Sequence[str], by_frame: bool) -> bytes:
     """The cars of a run, in one piece: tensors by themselves would each take an open file with them."""
     root, detections, masks, name, with_elsewhere = run
-    found = refined_cars(root, detections, masks, name, overrides, with_elsewhere)
+    found = refined_cars(root, detections, masks, name, overrides, with_elsewhere and not by_frame, by_frame)
     count = sum(len(frame.result) for frame in found.frames)
     print(f"{root.name} {detections.name}: {count} cars", file=sys.stderr, flush=True)
     return pickle.dumps(found)
@@ -84,14 +85,16 @@ def run(args: argparse.Namespace) -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     runs = [run for run in runs_of(args) if run.frames]
     roots = list(dict.fromkeys(run.root for run in runs))
-    models = {root: fitted([run for run in runs if run.root != root]) for root in roots} if roots[1:] else {}
-    of_all = fitted(runs)
+    others = roots[1:] and not args.by_frame
+    models = {root: fitted([run for run in runs if run.root != root]) for root in roots} if others else {}
+    of_all = bundled_trust_model() if args.by_frame else fitted(runs)
     of_all.save(args.out / "trust_model.json")
     judged = {id(run): run.judged(models.get(run.root, of_all).image_noise) for run in runs}
-    how = "Each root is judged by what the others have told." if models else "One root is judged by its own cars."
+    own = "the package" if args.by_frame else "its own cars"
+    how = f"Each root is judged by {'what the others have told' if models else own}."
     parts = [
         how,
-        _policies(runs, judged, models, of_all),
+        _policies(runs, judged, models, of_all, load_config(None, args.set).acceptance),
         _reliability(runs, judged, models, of_all),
         _coverage(runs, judged),
         _noises({"all": of_all, **{f"without {root}": model for root, model in models.items()}}),
@@ -101,7 +104,11 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _policies(
-    runs: Sequence[Cars], judged: Mapping[int, Judged], models: Mapping[str, TrustModel], of_all: TrustModel
+    runs: Sequence[Cars],
+    judged: Mapping[int, Judged],
+    models: Mapping[str, TrustModel],
+    of_all: TrustModel,
+    limits: AcceptanceConfig,
 ) -> str:
     """What comes back, a row for each detector on each root: means over the draws, with their standard deviation."""
     head = "cars", "runs, cars", "input", "images alone (worse)", "most probable (worse)", "returned (worse, share)"
@@ -110,13 +117,13 @@ def _policies(
         some = [run for run in runs if (run.root, run.detector) == (root, detector)]
         model = models.get(root, of_all)
         cars = [judged[id(run)] for run in some]
-        kept = [returned(each, model.car_is_there, POLICY)[1] for each in cars]
+        kept = [returned(each, model.car_is_there, limits) for each in cars]
         chosen = [np.where(k, c.after, c.before) for k, c in zip(kept, cars, strict=True)]
         inputs = _spread([float(c.before.mean()) for c in cars])
         cells = [_cell(cars, [c.images for c in cars]), _cell(cars, [c.after for c in cars]), _cell(cars, chosen)]
         cells[2] = f"{cells[2][:-1]}, {np.mean([k.mean() for k in kept]):.0%})"
         others = [run.judged(model.image_noise, elsewhere=True) for run in some if run.elsewhere]
-        there = [returned(each, model.car_is_there, POLICY)[1] for each in others]
+        there = [returned(each, model.car_is_there, limits) for each in others]
         cells.append(f"{sum(k.sum() for k in there)} of {sum(len(k) for k in there)}" if there else "")
         counts = f"{len(some)}, {np.mean([len(c.before) for c in cars]):.0f}"
         rows.append(f"| {root} {detector} | {counts} | {inputs} | " + " | ".join(cells) + " |")
@@ -137,7 +144,7 @@ def _reliability(
 ) -> str:
     """Predicted beside true shares, in bins of the prediction."""
     pairs = [
-        (returned(judged[id(run)], models.get(run.root, of_all).car_is_there, POLICY)[0], outcomes(judged[id(run)]))
+        (probabilities(judged[id(run)], models.get(run.root, of_all).car_is_there), outcomes(judged[id(run)]))
         for run in runs
     ]
     predicted, true = (np.concatenate(x) for x in zip(*pairs, strict=True))
@@ -187,6 +194,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="folders with labels of KITTI's object benchmark; may be repeated",
     )
     parser.add_argument("--draws", type=int, default=10, help="of each simulated detector")
+    parser.add_argument(
+        "--by-frame", action="store_true", help="each frame tells of rig and detector by itself; judge the package"
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--set", nargs="+", default=["compile=off"], metavar="KEY=VALUE", help="other settings")

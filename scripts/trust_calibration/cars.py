@@ -24,6 +24,7 @@ from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.trust import WORSE_BY, ImageNoise, LogisticHead
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.detector_noise import detector_sigmas, rows_of
+from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.from_files import estimate_rigs
 from directshape_torch.rig.rigs import RigEstimates
 from directshape_torch.scene import Detections
@@ -63,16 +64,17 @@ class Cars:
     detector: str
     frames: list[Frame]
     elsewhere: list[Frame]
-
-    def comparisons(self, noise: ImageNoise) -> Tensor:
-        """Rows (N, 15) of `rig.detector_noise`."""
-        return torch.cat([rows_of(compared(frame.result, frame.cars, noise)) for frame in self.frames])
+    by_frame: bool  # rig and detector are what each frame tells by itself
 
     def judged(self, noise: ImageNoise, elsewhere: bool = False) -> Judged:
         """The cars as this image noise has them, with the detector's that the run learns by it."""
-        sigmas = detector_sigmas(self.comparisons(noise))
-        frames = self.elsewhere if elsewhere else self.frames
-        parts = [_judged(frame, noise, sigmas) for frame in frames]
+        rows = [rows_of(compared(frame.result, frame.cars, noise)) for frame in self.frames]
+        of_run = detector_sigmas(torch.cat(rows))
+        if elsewhere or not self.by_frame:
+            parts = [_judged(frame, noise, of_run) for frame in (self.elsewhere if elsewhere else self.frames)]
+        else:
+            pairs = zip(self.frames, rows, strict=True)
+            parts = [_judged(frame, noise, detector_sigmas(own)) for frame, own in pairs]
         return Judged(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
@@ -117,7 +119,13 @@ def errors_of_images(frame: Frame) -> tuple[Array, Array]:
 
 
 def refined_cars(
-    root: Path, detections: Path, masks: Path, detector: str, overrides: Sequence[str], with_elsewhere: bool
+    root: Path,
+    detections: Path,
+    masks: Path,
+    detector: str,
+    overrides: Sequence[str],
+    with_elsewhere: bool,
+    by_frame: bool,
 ) -> Cars:
     """All cars of a run, whose rigs are estimated from its detections, every result returned."""
     torch.set_num_threads(1)
@@ -126,11 +134,16 @@ def refined_cars(
     # What the images say alone, which is brought together with the detections as this script sees it.
     alone = replace(config.priors, detector_weight=0.0)
     config = replace(config, acceptance=EVERYTHING, check="off", priors=alone)
-    refiner = DirectShapeRefiner(config=config, rig=RigEstimates(estimate_rigs(dataset)))
+    refiner = DirectShapeRefiner(config=config, rig=None if by_frame else RigEstimates(estimate_rigs(dataset)))
     loaded = [dataset.load(frame_id) for frame_id in dataset.frame_ids]
-    frames = [frame for each in loaded for frame in _with_labels(refiner, each)]
+    frames = []
+    for each in loaded:
+        if by_frame:
+            refiner.rig = RigEstimate.of_frames(each.frame)
+            refiner.rig.update(each.frame, each.detections)
+        frames += _with_labels(refiner, each)
     elsewhere = _elsewhere(refiner, loaded) if with_elsewhere else []
-    return Cars(root.name, detector, frames, elsewhere)
+    return Cars(root.name, detector, frames, elsewhere, by_frame)
 
 
 def _with_labels(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> list[Frame]:
@@ -175,11 +188,15 @@ def _frame(
     return Frame(result.rows(index), chosen, CarBatch.from_scene(loaded.frame, chosen), boxes)
 
 
-def returned(judged: Judged, is_there: LogisticHead, limits: AcceptanceConfig) -> tuple[Array, NDArray[np.bool_]]:
-    """Probabilities (N, 2) with the chance that the car is there, and which boxes come back (N,)."""
-    probability = is_there(torch.from_numpy(judged.evidence)).numpy()[:, None] * judged.chance
+def probabilities(judged: Judged, is_there: LogisticHead) -> Array:
+    """Probabilities (N, 2) of better and not worse boxes, the chance that the car is there included."""
+    return np.asarray(is_there(torch.from_numpy(judged.evidence)).numpy()[:, None] * judged.chance)
+
+
+def returned(judged: Judged, is_there: LogisticHead, limits: AcceptanceConfig) -> NDArray[np.bool_]:
+    """Which boxes (N,) come back."""
     least = limits.min_probability_better, limits.min_probability_not_worse
-    return probability, np.asarray((probability >= least).all(axis=1))
+    return np.asarray((probabilities(judged, is_there) >= least).all(axis=1))
 
 
 def outcomes(judged: Judged) -> NDArray[np.bool_]:
