@@ -52,7 +52,7 @@ def _of_rig(rig: RigEstimate) -> str:
     if rig.is_guess:
         return f"{off}: {len(rig.rows)} detections hardly show it; give more frames, or --rig FILE (docs/your_rig.md)"
     if sigma * rig.metres_per_pixel(_AT_M) > _LARGE_M:
-        return f"{off}; calibrate-stereo knows better (docs/your_rig.md)"
+        return f"{off}; calibrate-rig knows better (docs/your_rig.md)"
     return off
 
 

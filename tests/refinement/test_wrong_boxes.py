@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from directshape_torch import DirectShapeRefiner, RefinementResult, load_config
+from directshape_torch import Detections, DirectShapeRefiner, RefinementResult, load_config
+from directshape_torch.geometry.box_formats import poses_to_boxes
 from directshape_torch.laboratory.scenes import load_scene, select_detections
 from directshape_torch.status import Status
 
@@ -54,3 +55,14 @@ def test_boxes_and_masks_of_another_image_show_no_car() -> None:
         result: RefinementResult = refiner(replace(scene.frame, **images), scene.detections)
         num_refined += int(result.refined.sum())
     assert num_refined <= 10, "of 36; without a look at where their pixels match best 18"
+
+
+def test_masks_of_other_cars_are_refused_by_name() -> None:
+    scene = load_scene()
+    masks = scene.detections.mask_left.dense().roll(1, dims=0)
+    boxes = poses_to_boxes(scene.detections.T_cam_obj, scene.detections.dimensions_hwl, "kitti")
+    others = Detections.from_boxes(boxes, "kitti", mask_left=masks)
+    refiner = DirectShapeRefiner(config=load_config("default")).to(scene.detections.T_cam_obj.dtype)
+    result: RefinementResult = refiner(scene.frame, others)
+    assert not result.refined.any()
+    assert set(result.status) <= {Status.mask_missed, Status.no_match, Status.no_car, Status.rejected_worse}
