@@ -40,8 +40,8 @@ def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = T
     group.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line; default: all detection files")
     add_rig_option(
         group,
-        "a file of 'directshape calibrate-rig' or of a run corrects the stereo rig; auto: refine estimates it "
-        "(default: %(default)s)",
+        "a file of 'directshape calibrate-rig' or of a run corrects the stereo rig; auto: refine estimates it; "
+        "none: refine takes cameras to be exact unless --set rig.disparity_sigma_px says more (default: %(default)s)",
     )
     if with_disparity:
         group.add_argument(
