@@ -352,7 +352,7 @@ class SearchConfig(Settings):
 
 @dataclass(frozen=True)
 class AcceptanceConfig(Settings):
-    """Which results are returned; the input stands in for the others (status not_trusted)."""
+    """Which results are returned; the input stands in for the others (status not_trusted or no_car)."""
 
     min_probability_better: float = setting(
         0.5,
@@ -362,7 +362,7 @@ class AcceptanceConfig(Settings):
     )
     min_probability_not_worse: float = setting(
         0.8,
-        "least probability that it fell by at most 0.05; 0 for both returns every result",
+        "least probability that it fell by at most 0.05; 0 for both: no result is refused for its probabilities",
         at_least=0,
         at_most=1,
     )

@@ -43,7 +43,8 @@ class Status(enum.Enum):
     no_car = (
         "what the mask shows is probably not this car, so the input is returned: halves of it lie at different depths, "
         "it looks unlike itself in the right image, or its place is more standard deviations from the detector's than "
-        "a car's is; check that mask and box are of one car"
+        "a car's is; check that mask and box are of one car, or set both probabilities of `acceptance` to 0 to have it "
+        "all the same"
     )
 
     @property

@@ -47,12 +47,12 @@ def _unseen(frames: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 def _of_rig(rig: RigEstimate) -> str:
     _, sigma = rig.in_the_middle()
-    off = f"the rig's disparity is known to {sigma:.2f} px, so all cars of a place may be off alike"
+    off = f"the rig's disparity is known to {sigma:.2f} px, so cars in one part of the image may be off alike"
     off += f", by {sigma * rig.metres_per_pixel(_AT_M):.2f} m at {_AT_M:.0f} m"
     if rig.is_guess:
         return f"{off}: {len(rig.rows)} detections hardly show it; give more frames, or --rig FILE (docs/your_rig.md)"
     if sigma * rig.metres_per_pixel(_AT_M) > _LARGE_M:
-        return f"{off}; calibrate-rig knows better (docs/your_rig.md)"
+        return f"{off}; calibrate-rig can tell it better (docs/your_rig.md)"
     return off
 
 
@@ -64,10 +64,8 @@ def _doubtful(frames: Mapping[str, Mapping[str, Any]]) -> list[str]:
     ]
     if not cars:
         return []
-    named = [
-        f"line {line} of {name} (worse with {1 - probability:.2f}, {distance:.1f} standard deviations from its box)"
-        if distance >= 0
-        else f"line {line} of {name} (worse with {1 - probability:.2f})"
-        for probability, name, line, distance in sorted(cars)[:_NAMED]
-    ]
-    return [f"look first at {'; '.join(named)}"]
+    named = []
+    for probability, name, line, distance in sorted(cars)[:_NAMED]:
+        away = f", {distance:.1f} standard deviations from its box" if distance >= 0 else ""
+        named.append(f"line {line} of {name} ({1 - probability:.2f} probable to be worse{away})")
+    return [f"look first (2.6 standard deviations are usual) at {'; '.join(named)}"]

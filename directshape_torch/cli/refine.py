@@ -135,7 +135,12 @@ def run(args: argparse.Namespace) -> int:
         print(f"warning: {warning}", file=sys.stderr)
     print(format_summary(summary))
     # A report finds the rigs of the folder alone.
-    for sentence in verdict(summary.frames, rigs if args.rig == "auto" else []):
+    sentences = verdict(summary.frames, rigs if args.rig == "auto" else [])
+    if args.rig == "none" and refiner.config.rig.disparity_sigma_px == 0:
+        sentences.append(
+            "cameras are taken to be exact (--rig none): where they are not, more boxes are worse than that"
+        )
+    for sentence in sentences:
         print(f"verdict  {sentence}")
     print(f"results  {args.out}")
     return summary.exit_code

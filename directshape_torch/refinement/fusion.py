@@ -36,17 +36,17 @@ _RIDGE = 1e-9
 class DetectorComparison(CarRecord):
     """Where B refined cars have their box and where the detector had it, columns `CAR_QUANTITIES`, metres.
 
-    There are NaN for cars that were not refined.
+    There are NaN for cars that were not refined, but for `distance_in_sigmas`, which refused results keep.
 
     Attributes:
         distance: (B,) of the images' box along the ground, metres.
         difference: (B, 7) the detector's less the images'; headings modulo half a turn. NaN too for views of a track.
         sigma_images: (B, 7) standard deviations of what the images say.
-        gain: (B, 7, 7) the most probable box less the images' is `gain @ difference`; zeros where nobody knows what the
-            detector is off by.
+        gain: (B, 7, 7) the most probable box less the images' is `gain @ difference`; zeros where boxes are not
+            brought together.
         covariance: (B, 7, 7) of the most probable box; for views of a track of the images' box, which is returned.
         distance_in_sigmas: (B,) between both boxes, in the standard deviations of both; of seven quantities that are
-            as they should be it is about 2.6. NaN where nobody knows what the detector is off by.
+            as they should be it is about 2.6. NaN where boxes are not brought together.
     """
 
     distance: Annotated[Tensor, Dense("B")]

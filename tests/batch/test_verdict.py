@@ -31,8 +31,9 @@ def test_expected_numbers_are_those_of_refined_cars_alone() -> None:
 def test_the_most_doubtful_cars_are_named_first() -> None:
     chances, distances = np.array([0.93, 0.1, 0.88]), np.array([1.0, 2.0, np.nan])
     sentence = verdict(frames(probabilities_not_worse=chances, distances_in_sigmas=distances), [])[-1]
-    assert sentence.startswith("look first at line 3 of 000001 (worse with 0.12); line 3 of 000002 (worse with 0.12); ")
-    assert sentence.endswith("line 1 of 000002 (worse with 0.07, 1.0 standard deviations from its box)")
+    first = "look first (2.6 standard deviations are usual) at line 3 of 000001 (0.12 probable to be worse); line 3 of"
+    assert sentence.startswith(first)
+    assert sentence.endswith("line 1 of 000002 (0.07 probable to be worse, 1.0 standard deviations from its box)")
     assert "line 2" not in sentence
 
 

@@ -67,6 +67,7 @@ def test_frames_of_two_rigs_are_refined_in_one_run(
     file = ("--rig", str(tmp_path / "out" / "rig.json"))
     assert main(command(source, tmp_path / "by_file", *file)) == 0
     assert main(command(source, tmp_path / "none", "--rig", "none")) == 0
+    assert "verdict  cameras are taken to be exact (--rig none)" in capsys.readouterr().out
     for name in ("data/000000.txt", "data/000001.txt"):
         by_rig, by_file, by_none = ((tmp_path / each / name).read_text() for each in ("out", "by_file", "none"))
         assert by_rig == by_file != by_none
