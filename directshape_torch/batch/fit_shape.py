@@ -118,7 +118,7 @@ def fit_shape(
 def _fitter(prior: ShapePrior | None, samples: PointSamples) -> DirectShapeRefiner:
     """A refiner whose terms are the points and the priors."""
     plain = RefinerConfig(compile="off", check="off", rig=RigConfig(0.0))
-    # Images and a detector have no part in it.
+    # Images and a detector have no part in the fit.
     config = replace(
         plain,
         silhouette=replace(plain.silhouette, weight=0.0),

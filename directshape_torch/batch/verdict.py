@@ -10,7 +10,7 @@ from directshape_torch.status import Status
 
 _NAMED = 5
 _AT_M = 30.0
-# So much at 30 m spoils boxes that were good.
+# Boxes that were good are spoilt where a rig moves cars at 30 m by more than this.
 _LARGE_M = 0.4
 
 
@@ -31,7 +31,8 @@ def verdict(frames: Mapping[str, Mapping[str, Any]], rigs: Sequence[RigEstimate]
     words = f"{refined} of {num_cars} boxes are refined"
     if better or worse:
         words += f": about {better:.1f} of them better than before, {worse:.1f} worse by more than 0.05 of BEV IoU"
-    return [words, *_unseen(done), *map(_of_rig, rigs), *_doubtful(done)]
+    names = [f"rig {number}" for number in range(1, len(rigs) + 1)] if rigs[1:] else ["the rig"]
+    return [words, *_unseen(done), *map(_of_rig, names, rigs), *_doubtful(done)]
 
 
 def _count(frames: Mapping[str, Mapping[str, Any]], statuses: Sequence[Status]) -> int:
@@ -45,9 +46,9 @@ def _unseen(frames: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return [f"the images do not show the car of {count} masks where its box is: check these masks and boxes"]
 
 
-def _of_rig(rig: RigEstimate) -> str:
+def _of_rig(name: str, rig: RigEstimate) -> str:
     _, sigma = rig.in_the_middle()
-    off = f"the rig's disparity is known to {sigma:.2f} px, so cars in one part of the image may be off alike"
+    off = f"the disparity of {name} is known to {sigma:.2f} px, so cars in one part of the image may be off alike"
     off += f", by {sigma * rig.metres_per_pixel(_AT_M):.2f} m at {_AT_M:.0f} m"
     if rig.is_guess:
         return f"{off}: {len(rig.rows)} detections hardly show it; give more frames, or --rig FILE (docs/your_rig.md)"

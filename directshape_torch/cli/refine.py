@@ -111,8 +111,8 @@ def run(args: argparse.Namespace) -> int:
     options = RefineOptions(args.meshes, args.overlays, batch_frames, args.workers, args.threads, args.retries)
     chosen = [] if args.method is None else [f"method={args.method}"]
     extra = [] if args.lidar is None else [LidarPoints()]
-    known = ["rig.disparity_sigma_px=0"] if args.rig == "none" else []
-    refiner = make_refiner(args.config, [*known, *args.set, *chosen], args.prior, args.device, extra)
+    exact = ["rig.disparity_sigma_px=0"] if args.rig == "none" else []
+    refiner = make_refiner(args.config, [*exact, *args.set, *chosen], args.prior, args.device, extra)
     if args.disparity is not None and refiner.config.method in ("direct", "box_alignment"):
         raise InputError(
             "--disparity", "a method that uses it", refiner.config.method, "add --method geometric or combined"
@@ -134,7 +134,7 @@ def run(args: argparse.Namespace) -> int:
     for warning in summary.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     print(format_summary(summary))
-    # A report finds the rigs of the folder alone.
+    # The report of this run, which finds the rigs of the folder alone, shall say the same.
     sentences = verdict(summary.frames, rigs if args.rig == "auto" else [])
     if args.rig == "none" and refiner.config.rig.disparity_sigma_px == 0:
         sentences.append(

@@ -22,8 +22,8 @@ from directshape_torch.evaluation.matching import (
 from directshape_torch.evaluation.pose_error import CarErrors, errors_of
 from directshape_torch.io.kitti_labels import KittiObject, objects_in, objects_path
 from directshape_torch.io.result_files import read_shapes
+from directshape_torch.refinement.trust import WORSE_BY
 
-WORSE_BY_BEV_IOU = 0.05
 # Depth of the label along the optical axis, metres; the last bin is open.
 _DEPTH_BINS_M = (0.0, 10.0, 20.0, 30.0, 45.0, float("inf"))
 
@@ -159,7 +159,7 @@ def _summarised(name: str, cars: Sequence[ComparedCar], num_draws: int, seed: in
     for metric in METRICS:
         before, after = (np.array([metric.value(getattr(car, when)) for car in cars]) for when in ("before", "after"))
         metrics[metric.key] = bootstrap.summary(before, after, metric.statistic)
-    worse = np.array([car.after.bev_iou < car.before.bev_iou - WORSE_BY_BEV_IOU for car in cars], dtype=np.float64)
+    worse = np.array([car.after.bev_iou < car.before.bev_iou - WORSE_BY for car in cars], dtype=np.float64)
     return GroupSummary(name, len(cars), metrics, bootstrap.estimate(worse))
 
 

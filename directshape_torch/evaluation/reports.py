@@ -13,7 +13,7 @@ import numpy as np
 
 from directshape_torch.evaluation import comparison, evaluate_shapes
 from directshape_torch.evaluation.bootstrap import MetricSummary
-from directshape_torch.evaluation.comparison import WORSE_BY_BEV_IOU, ComparedCar, Comparison, GroupSummary, Metric
+from directshape_torch.evaluation.comparison import ComparedCar, Comparison, GroupSummary, Metric
 from directshape_torch.evaluation.evaluate_shapes import EvaluatedCar, ShapeCurve, ShapeScores
 from directshape_torch.evaluation.kitti_ap import ApScore, KittiScores
 from directshape_torch.evaluation.kitti_rules import DIFFICULTIES, NUM_RECALL_POINTS
@@ -21,6 +21,7 @@ from directshape_torch.evaluation.pose_error import PoseErrors
 from directshape_torch.evaluation.shape_error import TAUS_M
 from directshape_torch.evaluation.tables import align, number, with_interval, write_csv
 from directshape_torch.files.atomic_files import write_json
+from directshape_torch.refinement.trust import WORSE_BY
 
 _GROUP_METRICS = ("bev_iou_mean", "iou_3d_mean", "bev_iou_good_share", "centre_m_median", "yaw_deg_median")
 _AP_NAMES = {"2d": "2D box", "bev": "bird's-eye view", "3d": "3D box"}
@@ -41,7 +42,7 @@ def format_comparison(found: Comparison) -> str:
         return _text(heading, "nothing to compare: no counted label has a detection")
     rows = [["", "before", "after", "change"]]
     rows += [[m.label, *_with_change(m.unit, overall.metrics[m.key])] for m in comparison.METRICS]
-    rows.append([f"BEV IoU worse by {WORSE_BY_BEV_IOU}", "", with_interval("%", overall.worse_share), ""])
+    rows.append([f"BEV IoU worse by {WORSE_BY}", "", with_interval("%", overall.worse_share), ""])
     metrics = [metric for metric in comparison.METRICS if metric.key in _GROUP_METRICS]
     groups = [["group", "n", *(metric.label for metric in metrics), "worse"]]
     groups += [_group_row(group, metrics) for group in (overall, *found.by_depth) if group.num_detections]

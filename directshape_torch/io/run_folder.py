@@ -34,7 +34,7 @@ COPIED = "copied"
 """The status of lines of other classes, which a refinement leaves as they are."""
 
 _AGAIN = "refine the frame again"
-# Cars that are not worse with less than that are named in the summary, so many of a frame at most.
+# The summary names cars whose probability to be not worse is below this, and so many of a frame at most.
 _SURE, _MOST_DOUBTFUL = 0.95, 3
 # Within the folder, whoever has written the name.
 _FILE = re.compile(r"(data|shapes|meshes|overlays)/[^/\\]+")

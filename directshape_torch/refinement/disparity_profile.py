@@ -29,7 +29,7 @@ AMBIGUOUS_BELOW = 1.25
 MAX_PIXELS = 100
 """Pixels of each car that a curve is made of by default: enough for its shape at half the time of all."""
 _TINY = 1e-9
-# Images that differ by less than this, grey levels, are as alike as images are.
+# The noise of cameras alone lets two images of one surface differ by so many grey levels.
 _NOISE_GREY = 2.0
 # Residuals of several offsets at once: 1 MB in single precision, for what does not stay in the caches takes longer.
 _RESIDUALS_AT_ONCE = 250_000

@@ -47,7 +47,7 @@ _LEAST_MATCHED_SHARE = 0.1
 # The pixels of a car that is there have their best disparity where it ended, and know it to this many pixels. Most
 # boxes and masks that are laid on other images fail in this (scripts/calibrate_trust.py, column "elsewhere").
 _LARGEST_OFFSET_SIGMA_PX = 0.5
-# Below it the mask rather shows another car or none than this one.
+# A mask whose car is there with less probability rather shows another car or none.
 _LEAST_IS_THERE = 0.5
 # Sigma along the viewing ray over the depth; of these cars at most 0.1.
 _LARGEST_DEPTH_SHARE = 0.2

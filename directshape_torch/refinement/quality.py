@@ -17,7 +17,7 @@ from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.silhouette import MaskRows
 from directshape_torch.terms.term import Figures, Part, Sight
 
-# Grey levels: less contrast than that is noise.
+# The contrast of images that show nothing but noise, grey levels.
 _LEAST_CONTRAST = 0.3
 
 
@@ -35,7 +35,7 @@ class FitQuality(CarRecord):
         probability_better: (B,) calibrated probability that the returned box overlaps the true one more than the
             input does, seen from above; NaN for all methods but "direct".
         probability_not_worse: (B,) that its overlap is at least the input's less 0.05. Figures of cars whose status is
-            `not_trusted` are of the refinement that was not returned.
+            `not_trusted` or `no_car` are of the refinement that was not returned.
     """
 
     mask_iou_left: Annotated[Tensor, Dense("B")]
@@ -96,9 +96,9 @@ def mask_ious(masks: MaskRows, seen: Sight) -> Tensor:
 
 
 def photometric_agreement(term: Photometric, at: Part) -> tuple[Tensor, Tensor, Tensor]:
-    """Of the usable pixels of B cars: mean absolute residual in grey levels, share of the pixel set, and contrast.
+    """The mean absolute residual (B,) in grey levels of the usable pixels, their share (B,) of the set, their contrast.
 
-    The contrast is the mean absolute deviation of grey levels from the mean of their neighbourhood.
+    The contrast (B,) is the mean absolute deviation of grey levels from the mean of their neighbourhood.
     """
     fixed, usable = term.pixel_set, at.where.usable
     in_set = usable & (fixed.rows.pixel_weight > 0)

@@ -211,14 +211,15 @@ class RefinementResult(CarRecord):
         if not len(self):
             return lines[0] + "\n" + lines[1]
         shown, left_out = self._printed_rows()
-        lines.append("  car      x      y      z  heading  length  mask IoU  better  status")
+        lines.append("  car      x      y      z  heading  length  mask IoU  better  not worse  status")
         chosen = self.detach()[shown].cpu()
         boxes, quality = chosen.to_boxes("kitti").tolist(), chosen.quality
         for place, (row, (x, y, z, _, _, length, heading)) in enumerate(zip(shown.tolist(), boxes, strict=True)):
-            iou, better = float(quality.mask_iou_left[place]), float(quality.probability_better[place])
+            figures = quality.mask_iou_left, quality.probability_better, quality.probability_not_worse
+            iou, better, not_worse = (float(figure[place]) for figure in figures)
             lines.append(
-                f"  {row:3d} {x:6.2f} {y:6.2f} {z:6.2f} {heading:8.2f} {length:7.2f} {iou:9.2f} {better:7.2f}  "
-                f"{chosen.status[place].name}"
+                f"  {row:3d} {x:6.2f} {y:6.2f} {z:6.2f} {heading:8.2f} {length:7.2f} {iou:9.2f} "
+                f"{better:7.2f} {not_worse:10.2f}  {chosen.status[place].name}"
             )
         return "\n".join(lines + left_out)
 

@@ -155,14 +155,12 @@ def _loss(error: Tensor, hwl: Tensor, turned: Tensor) -> Tensor:
 @made_once
 def _student(dtype: torch.dtype, device: torch.device) -> Tensor:
     """Samples (2 S, 7) of Student's t of 4 degrees of freedom and scale 1, evenly spread over its probability."""
-    uniform = torch.quasirandom.SobolEngine(
-        9
-    ).draw(  # type: ignore[no-untyped-call]
-        _NUM_SAMPLES + 1, dtype=torch.float64
-    )[1:]
+    engine = torch.quasirandom.SobolEngine(9)  # type: ignore[no-untyped-call]
+    # The first of its points is a corner, where the distribution is infinite.
+    uniform = engine.draw(_NUM_SAMPLES + 1, dtype=torch.float64)[1:]
     normal = math.sqrt(2) * torch.erfinv(2 * uniform[:, :7] - 1)
     # The sum of two exponential variables, twice, is chi-squared of 4 degrees of freedom.
     chi_squared = -2 * uniform[:, 7:].log().sum(dim=1, keepdim=True)
     samples = normal * (_DEGREES_OF_FREEDOM / chi_squared).sqrt()
-    # To either side of the middle alike.
+    # Samples and their mirror images have the mean of the distribution.
     return torch.cat([samples, -samples]).to(device=device, dtype=dtype)

@@ -14,11 +14,11 @@ from directshape_torch.batch.run_log import read_log
 from directshape_torch.batch.run_status import read_status
 from directshape_torch.batch.verdict import verdict
 from directshape_torch.errors import InputError
-from directshape_torch.evaluation.comparison import WORSE_BY_BEV_IOU
 from directshape_torch.files.atomic_files import replaced_file
 from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.run_manifest import flatten, hash_fields
+from directshape_torch.refinement.trust import WORSE_BY
 from directshape_torch.report.car_rows import CarRow, car_rows, choose_frames
 from directshape_torch.report.frame_details import frame_details
 from directshape_torch.report.page_parts import data_block, data_url, mesh_data, page_frame
@@ -175,5 +175,5 @@ def _mean_errors(rows: Sequence[CarRow]) -> dict[str, Any] | None:
         means[f"share_over_0.7_{side}"] = None if None in overlaps else statistics.fmean(v > 0.7 for v in overlaps)
     pairs = [(row["iou_before"], row["iou_after"]) for row in counted]
     changes = [after - before for before, after in pairs if before is not None and after is not None]
-    worse = sum(change < -WORSE_BY_BEV_IOU for change in changes) if changes else None
-    return {"cars": len(counted), "worse": worse, "worse_by_iou": WORSE_BY_BEV_IOU, **means}
+    worse = sum(change < -WORSE_BY for change in changes) if changes else None
+    return {"cars": len(counted), "worse": worse, "worse_by_iou": WORSE_BY, **means}

@@ -88,7 +88,7 @@ def test_who_does_not_move_is_not_worse_and_who_moves_far_is_better_if_that_is_k
     sure, unsure = probabilities(nothing, far, covariance, *at_once)[0].tolist()
     assert sure > 0.95
     assert unsure < 0.75
-    # The same from the detector's side.
+    # With the boxes exchanged the detector's is the better one.
     assert probabilities(far, nothing, covariance, *at_once)[0][0] < 0.05
 
 
