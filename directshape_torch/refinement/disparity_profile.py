@@ -186,9 +186,10 @@ def disparity_profile(
     per_px = -1 / (term.cars.K_right[:, 0, 0] * term.cars.T_right_cam[:, 0, 3])
     # A few offsets at a time where the pixels are many, so that memory stays that of the other evaluations.
     num_parts = -(-rows.neighbour_weight.numel() * 2 * len(offsets) // _RESIDUALS_AT_ONCE)
+    parts = _quarters(rows)
     quarters = torch.cat(
         [
-            shifted_costs(rows, term.config, _quarters(rows), depth, on_surface, per_px, some)
+            shifted_costs(rows, term.config, parts, depth, on_surface, per_px, some)
             for some in offsets.to(depth).tensor_split(num_parts)
         ],
         dim=2,
