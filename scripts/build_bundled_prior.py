@@ -1,11 +1,9 @@
 """Make `directshape_torch/assets/car_prior.safetensors`: principal components of a few hundred parametric cars.
 
     python scripts/build_bundled_prior.py [--num-cars 600 --num-codes 8 --out PATH]
-    python scripts/build_bundled_prior.py --kernel 32 --out kernel_prior.safetensors
 
 No mesh goes in: every car comes from `parametric_cars`. The ranges of its measures were
 adjusted by hand while looking at how the prior fits real car meshes.
-A kernel PCA of the same cars is not bundled: 32 components of grids weigh 3 MB, its results are no better.
 """
 
 from __future__ import annotations
@@ -21,7 +19,6 @@ from parametric_cars.measures import sample_car
 from parametric_cars.surfaces import car_sdf
 from tqdm import tqdm
 
-from directshape_torch.shape.kernel_pca_prior import KernelPCAShapePrior
 from directshape_torch.shape.mesh_to_sdf import GridSpec
 from directshape_torch.shape.pca_fit import fit_pca
 from directshape_torch.shape.prior_file import PriorProvenance
@@ -41,12 +38,9 @@ def main() -> None:
     parser.add_argument("--num-cars", type=int, default=600)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--num-codes", type=int, default=8)
-    parser.add_argument("--kernel", type=int, metavar="M", help="a kernel PCA over M linear components, for --out")
     bundled = Path(__file__).parents[1] / "directshape_torch" / "assets" / "car_prior.safetensors"
     parser.add_argument("--out", type=Path, default=bundled)
     args = parser.parse_args()
-    if args.kernel and args.out == bundled:
-        parser.error("--kernel needs --out")
     with Pool(args.processes) as pool:
         grids = pool.imap(sample_grid, range(args.num_cars))
         samples = torch.from_numpy(np.stack(list(tqdm(grids, total=args.num_cars, desc="cars", unit="car"))))
@@ -55,11 +49,7 @@ def main() -> None:
         licence="Apache-2.0",
         num_samples=args.num_cars,
     )
-    cars = samples, torch.tensor(GRID.origin), GRID.spacing_m, args.num_codes, provenance
-    if args.kernel:
-        KernelPCAShapePrior.fit(*cars, num_components=args.kernel).save(args.out)
-        return
-    prior = fit_pca(*cars)
+    prior = fit_pca(samples, torch.tensor(GRID.origin), GRID.spacing_m, args.num_codes, provenance)
     prior.save(args.out, torch.float16)
     mean, std = prior.dimensions_mean_hwl.tolist(), prior.dimensions_std_hwl.tolist()
     print("height, width, length, m: " + ", ".join(f"{m:.2f} +- {s:.2f}" for m, s in zip(mean, std, strict=True)))

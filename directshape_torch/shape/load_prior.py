@@ -8,7 +8,6 @@ from pathlib import Path
 
 from directshape_torch.errors import DataFormatError, shown
 from directshape_torch.numerics.checks import check_type
-from directshape_torch.shape.kernel_pca_prior import KernelPCAShapePrior
 from directshape_torch.shape.neural_prior import NeuralShapePrior
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.prior_file import read_description
@@ -23,7 +22,6 @@ BUNDLED_PRIORS: Mapping[str, Callable[[], ShapePrior]] = {
 _READERS: Mapping[str, Callable[[Path], ShapePrior]] = {
     PCAShapePrior.SCHEMA: PCAShapePrior.load,
     NeuralShapePrior.SCHEMA: NeuralShapePrior.load,
-    KernelPCAShapePrior.SCHEMA: KernelPCAShapePrior.load,
 }
 
 

@@ -207,15 +207,6 @@ TARGETS: dict[str, Target] = {
         ),
         ("tests/shape/test_neural_prior.py", "tests/shape/test_prior_protocol.py"),
     ),
-    "kernel_pca_prior": Target(
-        "directshape_torch/shape/kernel_pca_prior.py",
-        (
-            "KernelPCAShapePrior.coefficients",
-            "KernelPCAShapePrior.dimensions_and_derivative",
-            "CurvedGridShape.value_and_derivatives",
-        ),
-        ("tests/shape/test_kernel_pca_prior.py", "tests/shape/test_prior_protocol.py"),
-    ),
 }
 
 

@@ -34,7 +34,6 @@ from directshape_torch import (
 from directshape_torch.evaluation import pose_error, rotated_iou
 from directshape_torch.geometry import box3d, box_formats, disparity_field, image_boxes, projection, se3
 from directshape_torch.shape import pca_fit, zero_level
-from directshape_torch.shape.kernel_pca_prior import KernelPCAShapePrior
 from directshape_torch.shape.neural_prior import NeuralShapePrior
 from directshape_torch.shape.prior_file import PriorProvenance
 from directshape_torch.shape.sdf_grid import GridShape
@@ -42,7 +41,6 @@ from directshape_torch.shape.sdf_grid import GridShape
 MODULES = (
     "directshape_torch.evaluation.pose_error",
     "directshape_torch.evaluation.rotated_iou",
-    "directshape_torch.shape.kernel_pca_prior",
     "directshape_torch.shape.neural_prior",
     "directshape_torch.shape.pca_fit",
     "directshape_torch.shape.zero_level",
@@ -174,13 +172,6 @@ def grids() -> PCAShapePrior:
 
 
 @cache
-def curved() -> KernelPCAShapePrior:
-    codes = torch.randn(8, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float32)
-    made = PriorProvenance("a test", "Apache-2.0", 8)
-    return KernelPCAShapePrior.fit(grids().values(codes), grids().origin, 0.2, 3, made, num_components=3)
-
-
-@cache
 def network() -> NeuralShapePrior:
     torch.manual_seed(0)
     made = PriorProvenance("a test", "Apache-2.0", 8)
@@ -192,7 +183,7 @@ def network() -> NeuralShapePrior:
 
 FOOTPRINT = [0, 2, 5, 4, 6]
 OWNERS = torch.arange(20) % 2
-Prior = PCAShapePrior | KernelPCAShapePrior | NeuralShapePrior
+Prior = PCAShapePrior | NeuralShapePrior
 
 
 def of_prior(name: str, shape: str, make: Callable[[], Prior]) -> dict[str, Case]:
@@ -314,10 +305,7 @@ CASES: dict[str, Case] = {
     "FrameBatch.from_images": lambda n: tensors(frames(n)),
     "Detections.from_boxes": lambda n: tensors(detections(n)),
     **of_prior("PCAShapePrior", "GridShape", grids),
-    **of_prior("KernelPCAShapePrior", "CurvedGridShape", curved),
     **of_prior("NeuralShapePrior", "NeuralShape", network),
-    "KernelPCAShapePrior.coefficients": lambda n: curved().coefficients(n.code),
-    "KernelPCAShapePrior.fit": lambda _: [*curved.__wrapped__().buffers()],
     "CodedLinear.shift": lambda n: network().coded_layers()[0].shift(n.code),
     "pca_fit.fit_pca": lambda _: [*pca_fit.fit_pca(samples(), grids().origin, 0.2, 2, grids().provenance).buffers()],
     "pca_fit.training_codes": lambda _: pca_fit.training_codes(samples(), 2),
@@ -373,9 +361,7 @@ WITHOUT_NUMBERS = {
     "MaskCrops.padded", "MaskCrops.rows", "MaskCrops.where", "box_formats.box_form", "box_formats.check_upright",
     "image_boxes.enclosing_boxes",
     "CheckReport.count", "CheckReport.exit_code", "DisparityField.check_rig", "DisparityField.rig", "DisparityField.to",
-    "Finding.block", "GridShape.field", "KernelPCAShapePrior.load", "KernelPCAShapePrior.num_codes",
-    "KernelPCAShapePrior.origin", "KernelPCAShapePrior.provenance", "KernelPCAShapePrior.save",
-    "KernelPCAShapePrior.spacing_m", "NeuralShapePrior.coded_layers", "NeuralShapePrior.load",
+    "Finding.block", "GridShape.field", "NeuralShapePrior.coded_layers", "NeuralShapePrior.load",
     "NeuralShapePrior.load_bundled", "NeuralShapePrior.save", "PCAShapePrior.get_extra_state", "PCAShapePrior.load",
     "PCAShapePrior.load_bundled", "PCAShapePrior.num_codes", "PCAShapePrior.save", "PCAShapePrior.set_extra_state",
     "RefinementResult.refined", "RefinementResult.rows", "RefinementResult.status", "RefinementResult.to",

@@ -1,4 +1,4 @@
-"""The kernel PCA prior of a few parametric cars is a file that the refiner takes."""
+"""The prior of a few parametric cars is a file that the refiner takes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from directshape_torch.shape.load_prior import load_prior
 
 def test_a_prior_of_five_cars(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "prior.safetensors"
-    words = ["--num-cars", "5", "--num-codes", "2", "--kernel", "3", "--out", str(out)]
+    words = ["--num-cars", "5", "--num-codes", "2", "--out", str(out)]
     monkeypatch.setattr(sys, "argv", ["build_bundled_prior", *words])
     script.main()
     refiner = DirectShapeRefiner(load_prior(out))

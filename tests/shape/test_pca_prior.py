@@ -3,7 +3,7 @@ import torch
 from helpers.priors import first_components
 
 from directshape_torch.errors import InputError
-from directshape_torch.shape.pca_fit import fit_pca
+from directshape_torch.shape.pca_fit import fit_pca, training_codes
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.prior_file import PriorProvenance
 from directshape_torch.shape.zero_level import zero_level_extents
@@ -60,6 +60,14 @@ def test_components_equal_those_of_a_singular_value_decomposition(samples, band_
     torch.testing.assert_close(
         prior.dimensions_basis_hwl, torch.linalg.lstsq(code, hwl - hwl.mean(0)).solution.T, atol=1e-9, rtol=0
     )
+
+
+def test_training_codes_are_white_and_give_the_samples_back(prior, samples):
+    code = training_codes(samples, 4)
+    torch.testing.assert_close(code.mean(0), torch.zeros(4, dtype=torch.float64), atol=1e-9, rtol=0)
+    torch.testing.assert_close(code.T.cov(), torch.eye(4, dtype=torch.float64), atol=1e-9, rtol=0)
+    near = samples.abs() < 0.1
+    assert (prior.values(code) - samples)[near].abs().mean() < 0.3 * (prior.mean - samples)[near].abs().mean()
 
 
 def test_positive_first_code_makes_the_car_larger(prior):

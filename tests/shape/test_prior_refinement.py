@@ -63,7 +63,7 @@ def test_gradients_through_the_refinement_reach_the_tensors_of_the_prior(
     kind: str, scene_of: Callable[[str], Street]
 ) -> None:
     """Two unrolled Gauss-Newton steps against differences of the whole refinement."""
-    scene, name = scene_of(kind), {"pca": "mean", "neural": "layers.1.weight", "kernel_pca": "weights"}[kind]
+    scene, name = scene_of(kind), "mean" if kind == "pca" else "layers.1.weight"
     config = replace(
         LIGHT,
         stages=(StageConfig(1.0, 0, 2),),
