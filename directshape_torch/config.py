@@ -194,11 +194,6 @@ class PhotometricConfig(Settings):
         'how the brightness of the two images is matched, for each car at the start of each stage: "gain" (a factor), '
         '"affine" (a factor and an offset, for cameras of different black level or contrast) or "none" (the paper)',
     )
-    patch: Literal["plain", "zero_mean", "normalised"] = setting(
-        "plain",
-        'residuals of a neighbourhood of eight pixels as they are ("plain", the paper), without its brightness '
-        '("zero_mean") or without its brightness and contrast ("normalised"), wherever in the image they change',
-    )
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,6 @@ ABLATION = {
     "silhouette only": "photometric.weight=0",
     "photometric only": "silhouette.weight=0",
     "the paper's product silhouette": "silhouette.form=product",
-    "patches without brightness and contrast": "photometric.patch=normalised",
     "factor and offset a car": "photometric.brightness=affine",
     "no priors at all": f"priors.shape_weight=0 priors.dimensions_weight=0 {_NO_GROUND}",
     "no shape prior": "priors.shape_weight=0",

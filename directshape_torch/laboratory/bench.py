@@ -32,7 +32,7 @@ from directshape_torch.terms.silhouette import contour_zeta
 from directshape_torch.terms.term import Linear, Sight, Term, linear_of
 
 TERM_NAMES = (
-    "silhouettes", "silhouettes_product", "photometric", "photometric_normalised", "point_cloud",
+    "silhouettes", "silhouettes_product", "photometric", "point_cloud",
     "shape", "height", "tilt_normal", "tilt_cosine", "dimensions", "pose",
 )  # fmt: skip
 TRACK_NAMES = (*MOTION_NAMES, NEXT_VIEW_NAME)
@@ -99,7 +99,6 @@ class Bench:
         other_forms = replace(
             config,
             silhouette=replace(config.silhouette, form="product"),
-            photometric=replace(config.photometric, patch="normalised", brightness="affine"),
             priors=replace(config.priors, tilt_form="cosine"),
         )
         # Pixel sets are fixed where a refinement would begin, so that rows get lost on the way to the state.
@@ -187,12 +186,12 @@ def _of_a_track(problem: CarProblem, cars: CarBatch, state: CarState) -> CarProb
 
 
 def _named(stage: CarStage, other_forms: CarStage) -> dict[str, Term]:
-    """The terms of a stage and the other forms of three of them; those of a user under their own names."""
+    """The terms of a stage and the other forms of two of them; those of a user under their own names."""
     plain, other = (
         {"silhouettes" if len(t.names) > 1 else t.names[0]: t for t in s.terms} for s in (stage, other_forms)
     )
     plain |= {"tilt_normal": plain.pop("tilt"), "tilt_cosine": other["tilt"]}
-    plain |= {"silhouettes_product": other["silhouettes"], "photometric_normalised": other["photometric"]}
+    plain |= {"silhouettes_product": other["silhouettes"]}
     return {name: plain.pop(name) for name in TERM_NAMES} | plain
 
 

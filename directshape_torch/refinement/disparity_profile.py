@@ -266,7 +266,7 @@ def shifted_costs(
 ) -> Tensor:
     """Costs (Q, S, n, B), float64, of parts of a row of pixels of each car, with surfaces moved by disparities."""
     inverse = 1 / depth[:, None] + offsets_px[:, None, None] * per_px[:, None]
-    residual, comparable = residuals_at(rows, config, 1 / inverse)
+    residual, comparable = residuals_at(rows, 1 / inverse)
     usable = on_surface[:, None] & comparable & (inverse > 0)
     rho = photometric_norm(config, torch.where(usable[..., None], residual, config.lost_grey_levels)).rho
     cost = (rho * (rows.pixel_weight[..., None] * rows.neighbour_weight.movedim(0, -1))).sum(-1)

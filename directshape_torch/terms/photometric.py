@@ -169,7 +169,7 @@ class Photometric(Term):
         if ratio is not None:
             J_depth_offset = -depth * depth * self.cars.inverse_depth_of_offset(torch.ones_like(state.offset_px))[owner]
             J_depth_state = torch.cat([J_depth_state / (ratio * ratio)[..., None], J_depth_offset[..., None]], dim=-1)
-        compare = compared(rows, self.config, depth)
+        compare = compared(rows, depth)
         usable = found & compare.comparable
         residual = torch.where(usable[..., None], compare.residual, self.config.lost_grey_levels)
         J = torch.where(usable[..., None], compare.J_residual_depth, 0.0)
@@ -179,7 +179,7 @@ class Photometric(Term):
         rows = self.pixel_set.rows
         depth = depth_of(rows.rays.in_objects(state.T_obj_cam), rows.rays.owner, field, where)
         depth, _ = self.warped_depth(depth, state, rows.rays.owner)
-        residual, _ = residuals_at(rows, self.config, depth)
+        residual, _ = residuals_at(rows, depth)
         return torch.where(where.usable[..., None], residual, self.config.lost_grey_levels)
 
     def norm(self, residual: Tensor) -> robust.RobustValue:

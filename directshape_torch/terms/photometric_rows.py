@@ -1,15 +1,14 @@
 """Pixels of the left image compared with the right one, each with its neighbourhood warped by one depth.
 
 Cameras, the rig's residual field and the pyramid level are in two lines per neighbour, `along_ray depth +
-along_baseline`, so a comparison at any depths is a few products and a lookup. Exposure, vignetting and veiling glare
-change slowly over the image, so over eight pixels they are an offset and a factor: `patch_residual` can take both off.
+along_baseline`, so a comparison at any depths is a few products and a lookup.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,15 +21,11 @@ from directshape_torch.numerics.tensors import all_along, made_once
 from directshape_torch.rows import OcclusionMap, PixelSamples, Rays, Rows
 from directshape_torch.terms.cars import CarBatch
 
-PatchForm = Literal["plain", "zero_mean", "normalised"]
-
 # DSO's pattern of 8 neighbourhood pixels (Engel et al., Direct Sparse Odometry, fig. 4), as (du, dv).
 DSO_PATTERN: tuple[tuple[int, int], ...] = ((0, -2), (-1, -1), (1, -1), (-2, 0), (0, 0), (2, 0), (-1, 1), (0, 2))
 CENTRE = DSO_PATTERN.index((0, 0))
 # c of the gradient weight c^2 / (c^2 + |grad I_l|^2) (DSO), grey levels per pixel.
 GRADIENT_CONSTANT = 50.0
-# Standard deviation that a neighbourhood has at least for "normalised", grey levels: noise is not blown up.
-CONTRAST_FLOOR = 5.0
 # What is not so far in front of the right camera is not seen by it.
 _LEAST_DEPTH_M = 1e-6
 
@@ -210,31 +205,20 @@ def frame_view(images: GreyPair, frame: Tensor) -> tuple[Tensor, Tensor, Tensor,
     return first, step, last_u, last_v
 
 
-def compared(rows: PhotometricRows, config: PhotometricConfig, depth: Tensor) -> Comparison:
+def compared(rows: PhotometricRows, depth: Tensor) -> Comparison:
     """Residuals at depths (M, 64) with their derivatives, all neighbours warped with the pixel's own depth."""
     warped = warped_pixels(rows, depth)
     along, at = rows.along_ray, warped.at
     d_u = torch.addcmul(along[0], warped.u, along[2], value=-1) * warped.inverse_z
     d_v = torch.addcmul(along[1], warped.v, along[2], value=-1) * warped.inverse_z
-    plain, of_patch = _plain_and_patch(rows, config, at)
-    J = patch_derivative((at.d_u * d_u + at.d_v * d_v).movedim(-3, -1), plain, *of_patch)
-    return Comparison(patch_residual(plain, *of_patch), J, warped.is_comparable(rows.right))
+    J = (at.d_u * d_u + at.d_v * d_v).movedim(-3, -1)
+    return Comparison(warped.residual(rows), J, warped.is_comparable(rows.right))
 
 
-def residuals_at(rows: PhotometricRows, config: PhotometricConfig, depth: Tensor) -> tuple[Tensor, Tensor]:
+def residuals_at(rows: PhotometricRows, depth: Tensor) -> tuple[Tensor, Tensor]:
     """Residuals (..., M, 64, N) at depths (..., M, 64), and where (..., M, 64) they can be compared; differentiable."""
     warped = warped_pixels(rows, depth)
-    plain, of_patch = _plain_and_patch(rows, config, warped.at)
-    return patch_residual(plain, *of_patch), warped.is_comparable(rows.right)
-
-
-def _plain_and_patch(
-    rows: PhotometricRows, config: PhotometricConfig, at: BilinearPatch
-) -> tuple[Tensor, tuple[Tensor, Tensor, PatchForm, float]]:
-    """Right minus left grey levels (..., M, 64, N), and the other arguments of `patch_residual`."""
-    left, weight = rows.intensity_left, rows.neighbour_weight
-    of_patch = left.movedim(0, -1), weight.movedim(0, -1), config.patch, CONTRAST_FLOOR
-    return (at.value - left).movedim(-3, -1), of_patch
+    return warped.residual(rows), warped.is_comparable(rows.right)
 
 
 class Warped(NamedTuple):
@@ -245,6 +229,10 @@ class Warped(NamedTuple):
     inverse_z: Tensor
     in_front: Tensor
     at: BilinearPatch
+
+    def residual(self, rows: PhotometricRows) -> Tensor:
+        """Right minus left grey levels (..., M, 64, N)."""
+        return (self.at.value - rows.intensity_left).movedim(-3, -1)
 
     def is_comparable(self, right: RightView) -> Tensor:
         """Pixels (..., M, 64) all of whose neighbours land in the right image, and that nothing nearer hides there."""
@@ -276,75 +264,3 @@ def _is_hidden(right: RightView, u_level: Tensor, v_level: Tensor) -> Tensor:
     covering = right.covering.index_select(0, entry.reshape(-1)).view(*entry.shape, 2)
     covered: Tensor = (covering < right.in_front[:, None]).any(dim=-1) & inside
     return covered
-
-
-def patch_residual(
-    residual: Tensor,  # (..., P, N) right minus left, grey levels
-    intensity_left: Tensor,  # (P, N) grey levels
-    weight: Tensor,  # (P, N) 1 for neighbours that count, 0 for the others
-    form: PatchForm,
-    contrast_floor: float,  # grey levels
-) -> Tensor:
-    """Residuals (..., P, N) of neighbourhoods in grey levels of the left image.
-
-    "zero_mean" takes the mean off both neighbourhoods; "normalised" (as in normalised cross-correlation) also gives the
-    right one the contrast of the left one. A contrast counts as at least the floor, so that noise is not blown up where
-    there is no texture.
-
-    Examples:
-        >>> left, weight = torch.tensor([[90.0, 110.0]]), torch.ones(1, 2)
-        >>> brighter = 0.5 * left + 30
-        >>> patch_residual(brighter - left, left, weight, "zero_mean", 1e-3)
-        tensor([[ 5., -5.]])
-        >>> patch_residual(brighter - left, left, weight, "normalised", 1e-3).round(decimals=3)
-        tensor([[0., 0.]])
-    """
-    if form == "plain":
-        return residual
-    if form == "zero_mean":
-        return _centred(residual, weight)
-    left, right = _centred(intensity_left, weight), _centred(residual + intensity_left, weight)
-    return _contrast(left, weight, contrast_floor) / _contrast(right, weight, contrast_floor) * right - left
-
-
-def patch_derivative(
-    J_residual_depth: Tensor,  # (P, N) of the plain residual, grey levels per metre
-    residual: Tensor,  # (P, N) plain
-    intensity_left: Tensor,  # (P, N)
-    weight: Tensor,  # (P, N)
-    form: PatchForm,
-    contrast_floor: float,
-) -> Tensor:
-    """Derivatives (P, N) of `patch_residual` by the one depth of each pixel: multiples of one row, as the plain ones.
-
-    With the right neighbourhood x, its mean taken off, and c its contrast: `d(x / c) = (dx - y mean(y dx)) / c` where
-    `y = x / c`, whatever the floor.
-
-    Examples:
-        >>> J, left, weight = torch.tensor([[1.0, 3.0]]), torch.zeros(1, 2), torch.ones(1, 2)
-        >>> patch_derivative(J, left, left, weight, "zero_mean", 1.0)
-        tensor([[-1.,  1.]])
-    """
-    if form == "plain":
-        return J_residual_depth
-    J = _centred(J_residual_depth, weight)
-    if form == "zero_mean":
-        return J
-    left, right = _centred(intensity_left, weight), _centred(residual + intensity_left, weight)
-    contrast = _contrast(right, weight, contrast_floor)
-    unit = right / contrast
-    return _contrast(left, weight, contrast_floor) / contrast * (J - unit * _mean(unit * J, weight))
-
-
-def _mean(values: Tensor, weight: Tensor) -> Tensor:
-    """Mean (..., P, 1) over the neighbours that count; zero where none does."""
-    return (weight * values).sum(dim=-1, keepdim=True) / weight.sum(dim=-1, keepdim=True).clamp_min(1)
-
-
-def _centred(values: Tensor, weight: Tensor) -> Tensor:
-    return values - _mean(values, weight)
-
-
-def _contrast(centred: Tensor, weight: Tensor, floor: float) -> Tensor:
-    """Standard deviation (..., P, 1), the floor added in squares: smooth, so that its derivative has no kink."""
-    return torch.sqrt(_mean(centred * centred, weight) + floor**2)

@@ -58,7 +58,7 @@ TARGETS: dict[str, Target] = {
     ),
     "photometric_rows": Target(
         "directshape_torch/terms/photometric_rows.py",
-        ("compared", "warped_pixels", "patch_derivative"),
+        ("compared", "warped_pixels"),
         (*_OFFSET, *_GRADIENTS, "tests/terms/test_photometric_rows.py", "tests/terms/test_photometric.py"),
     ),
     "point_cloud": Target(
@@ -280,15 +280,6 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
         "K @ points_cam[..., None]",
         "(-(K @ points_cam[..., None]))",
         "both sides of the ratio u = h_x / h_z change sign",
-    ),
-    *(
-        Equivalent("patch_derivative", text, f"(-{text})" if text.startswith("_") else f"(-({text}))", _IN_PAIRS)
-        for text in (
-            "_centred(intensity_left, weight)",
-            "_centred(residual + intensity_left, weight)",
-            "residual + intensity_left",
-            "right / contrast",
-        )
     ),
 )
 

@@ -42,8 +42,7 @@ PAPER = replace(
     sampling=replace(DEFAULT.sampling, occlusion_order="box_bottom"),
 )
 TRUNCATED = replace(DEFAULT, photometric=replace(DEFAULT.photometric, truncated=True, lost_grey_levels=20.0))
-NORMALISED = replace(DEFAULT, photometric=replace(DEFAULT.photometric, patch="normalised", brightness="affine"))
-CONFIGS = {"default": DEFAULT, "paper": PAPER, "truncated": TRUNCATED, "normalised": NORMALISED}
+CONFIGS = {"default": DEFAULT, "paper": PAPER, "truncated": TRUNCATED}
 
 
 def begun_stage(
