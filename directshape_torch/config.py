@@ -183,9 +183,6 @@ class PhotometricConfig(Settings):
     lost_grey_levels: float = setting(
         15.0, "a pixel of the set that loses its hit or leaves the right image pays the Huber norm of this", above=0
     )
-    truncated: bool = setting(
-        False, "residuals beyond lost_grey_levels (reflections, wrong matches) cost no more than a lost pixel"
-    )
     pixel_set: Literal["hit", "hit_and_mask"] = setting(
         "hit_and_mask", '"hit" (the paper) or "hit_and_mask" (hit and p_fg > 0.5)'
     )

@@ -58,7 +58,6 @@ OPTIONS: dict[str, tuple[str, ...]] = {
     "brightness affine": ("photometric.brightness=affine",),
     "silhouette product": ("silhouette.form=product",),
     "pixel set hit": ("photometric.pixel_set=hit",),
-    "truncated": ("photometric.truncated=true",),
     "tilt cosine": ("priors.tilt_form=cosine",),
     "unknown offset": ("rig.disparity_sigma_px=0.3",),
     "plain steps": (

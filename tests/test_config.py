@@ -55,7 +55,7 @@ def test_where_none_is_near_an_unknown_key_names_all_of_its_group() -> None:
         ({"silhouette": {"weight": True}}, "silhouette.weight: expected a number, got True"),
         ({"silhouette": {"samples_per_ray": 3.5}}, "silhouette.samples_per_ray: expected a whole number, got 3.5"),
         ({"silhouette": {"form": "sum"}}, "silhouette.form: expected one of closest_approach, product, got 'sum'"),
-        ({"photometric": {"truncated": 1}}, "photometric.truncated: expected true or false, got 1"),
+        ({"sampling": {"occlusion": 1}}, "sampling.occlusion: expected true or false, got 1"),
         ({"stages": {"a": 1}}, "stages: expected a list, got {'a': 1}"),
         ({"priors": {"dimensions_sigma_m": [0.1, 0.2]}}, "priors.dimensions_sigma_m: expected 3 entries"),
         ({"search": {"yaw_offsets_deg": ["x"]}}, "search.yaw_offsets_deg[0]: expected a number"),

@@ -70,7 +70,6 @@ def test_paper_has_the_weights_and_forms_of_the_paper() -> None:
     assert config.solver.accept_every_step
     # What the paper does not have.
     assert config.photometric.brightness == "none"
-    assert not config.photometric.truncated
     assert config.priors.dimensions_weight == 0
     assert config.search.disparity_offsets_px == config.search.yaw_offsets_deg == ()
 

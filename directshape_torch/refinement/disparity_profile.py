@@ -19,8 +19,9 @@ from directshape_torch.errors import InputError
 from directshape_torch.numerics.records import CarRecord, Dense
 from directshape_torch.numerics.tensors import made_once
 from directshape_torch.rows import CarSums, Rays
-from directshape_torch.terms.photometric import Photometric, Surface, photometric_norm
+from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.photometric_rows import PhotometricRows, residuals_at
+from directshape_torch.terms.robust import huber
 
 # Two minima nearer than this are one with a dent.
 APART_PX = 0.75
@@ -199,7 +200,7 @@ def disparity_profile(
     means = (term.config.weight * cost.mT / weight.clamp_min(1)[:, None] for cost in quarters.sum(dim=0))
     nowhere = num_pixels == 0
     at_input, at_end = (mean.masked_fill(nowhere[:, None], torch.nan) for mean in means)
-    noise = photometric_norm(term.config, rows.pixel_weight.new_full((1,), _NOISE_GREY)).rho
+    noise = huber(rows.pixel_weight.new_full((1,), _NOISE_GREY), term.config.huber_grey_levels).rho
     of_noise = (rows.pixel_weight * rows.neighbour_weight.sum(dim=0)).sum(dim=1, dtype=torch.float64) * noise
     halves_apart = _halves_apart(quarters[:, 1], offsets, of_noise).masked_fill(nowhere, torch.nan)
     return DisparityProfile(offsets, at_input, at_end, num_pixels.to(torch.float64), halves_apart)
@@ -268,6 +269,6 @@ def shifted_costs(
     inverse = 1 / depth[:, None] + offsets_px[:, None, None] * per_px[:, None]
     residual, comparable = residuals_at(rows, 1 / inverse)
     usable = on_surface[:, None] & comparable & (inverse > 0)
-    rho = photometric_norm(config, torch.where(usable[..., None], residual, config.lost_grey_levels)).rho
+    rho = huber(torch.where(usable[..., None], residual, config.lost_grey_levels), config.huber_grey_levels).rho
     cost = (rho * (rows.pixel_weight[..., None] * rows.neighbour_weight.movedim(0, -1))).sum(-1)
     return torch.stack([(cost * part).sum(-1) for part in parts.unbind()]).to(torch.float64)

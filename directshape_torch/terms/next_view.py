@@ -31,7 +31,6 @@ from directshape_torch.terms.photometric import (
     is_grazing,
     matched_brightness,
     near_surface,
-    photometric_norm,
 )
 from directshape_torch.terms.photometric_rows import CENTRE, frame_view, is_on_mask
 from directshape_torch.terms.term import Linear, Sight, Term
@@ -193,7 +192,7 @@ class NextView(Term):
         return torch.where(where.usable, at.value - self.image.grey, lost)[..., None]
 
     def norm(self, residual: Tensor) -> robust.RobustValue:
-        return photometric_norm(self.stereo.config, residual)
+        return robust.huber(residual, self.stereo.config.huber_grey_levels)
 
     def likeness(self, sight: Sight) -> tuple[Tensor, Tensor]:
         """How alike (B,) each view and the next are: the correlation of the grey levels of the pixels seen in both.

@@ -183,7 +183,7 @@ class Photometric(Term):
         return torch.where(where.usable[..., None], residual, self.config.lost_grey_levels)
 
     def norm(self, residual: Tensor) -> robust.RobustValue:
-        return photometric_norm(self.config, residual)
+        return robust.huber(residual, self.config.huber_grey_levels)
 
     def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Photometric:
         cars = self.cars.of_cars(keep, numbers)
@@ -245,13 +245,6 @@ def depth_of(rays: ObjectRays, owner: Tensor, field: Field, where: Surface) -> T
     slope = (where.normal_obj * rays.direction_obj).sum(0).detach()
     step = field.value(rays.at(near), owner) / torch.where(where.usable, slope, -1.0)
     return near - torch.where(where.usable, step, torch.zeros_like(step))
-
-
-def photometric_norm(config: PhotometricConfig, residual: Tensor) -> robust.RobustValue:
-    """What residuals cost: Huber's norm, beyond the cost of a lost pixel a constant where the configuration says so."""
-    if config.truncated:
-        return robust.truncated_huber(residual, config.huber_grey_levels, config.lost_grey_levels)
-    return robust.huber(residual, config.huber_grey_levels)
 
 
 def is_grazing(normal_obj: Tensor, direction_obj: Tensor) -> Tensor:

@@ -32,15 +32,6 @@ def huber(residual: Tensor, corner: float) -> RobustValue:
     return RobustValue(inner * (magnitude - 0.5 * inner), weight * residual, weight, weight)
 
 
-def truncated_huber(residual: Tensor, corner: float, limit: float) -> RobustValue:
-    """Huber's norm that stays constant beyond `limit`: a reflection is no worse than a pixel that is lost."""
-    norm = huber(residual.clamp(-limit, limit), corner)
-    beyond = residual.abs() >= limit
-    zero = torch.zeros_like(residual)
-    first, second = (torch.where(beyond, zero, w) for w in (norm.gradient_weight, norm.hessian_weight))
-    return RobustValue(norm.rho, first, second, second)
-
-
 def identity(residual: Tensor, floor: float) -> RobustValue:
     """`rho = r` for non-negative residuals, as reweighted least squares: weight 1/r, r floored (paper, E_silh as IRLS).
 

@@ -94,7 +94,7 @@ TARGETS: dict[str, Target] = {
     ),
     "robust": Target(
         "directshape_torch/terms/robust.py",
-        ("quadratic", "huber", "truncated_huber", "identity"),
+        ("quadratic", "huber", "identity"),
         ("tests/terms/test_robust.py",),
     ),
     "depth": Target(

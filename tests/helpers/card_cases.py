@@ -56,7 +56,7 @@ SETTINGS: dict[str, RefinerConfig] = {
 OTHER_FORMS = with_solver(
     replace(
         _FEW_STEPS,
-        photometric=replace(DEFAULT.photometric, brightness="affine", truncated=True, pixel_set="hit"),
+        photometric=replace(DEFAULT.photometric, brightness="affine", pixel_set="hit"),
         sampling=replace(DEFAULT.sampling, mode="uniform"),
         priors=replace(DEFAULT.priors, tilt_form="cosine", **_SIGMAS),
     ),

@@ -37,12 +37,11 @@ MARCHED = replace(DEFAULT, solver=replace(DEFAULT.solver, rays="marched"))
 PAPER = replace(
     MARCHED,
     silhouette=replace(DEFAULT.silhouette, form="product"),
-    photometric=replace(DEFAULT.photometric, pixel_set="hit", brightness="none", truncated=False),
+    photometric=replace(DEFAULT.photometric, pixel_set="hit", brightness="none"),
     priors=replace(DEFAULT.priors, tilt_form="cosine", tilt_weight=1e7, dimensions_weight=0.0),
     sampling=replace(DEFAULT.sampling, occlusion_order="box_bottom"),
 )
-TRUNCATED = replace(DEFAULT, photometric=replace(DEFAULT.photometric, truncated=True, lost_grey_levels=20.0))
-CONFIGS = {"default": DEFAULT, "paper": PAPER, "truncated": TRUNCATED}
+CONFIGS = {"default": DEFAULT, "paper": PAPER}
 
 
 def begun_stage(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers.ellipsoids import ellipsoid_prior
-from helpers.problems import DEFAULT, PAPER, TRUNCATED, begun_stage, figures_at, photometric_of
+from helpers.problems import CONFIGS, DEFAULT, PAPER, begun_stage, figures_at, photometric_of
 from helpers.synthetic_scene import cached_street, disturbed, street
 from helpers.term_cases import case
 from reference import residuals as reference
@@ -68,9 +68,9 @@ def test_grazing_rays_are_those_below_the_cosine() -> None:
     assert is_grazing(normal, direction)[0].tolist() == [True, False]
 
 
-@pytest.mark.parametrize("config", [PAPER, TRUNCATED], ids=["plain", "truncated"])
-def test_a_pixel_that_loses_its_surface_pays_the_constant(config: RefinerConfig) -> None:
-    stage, state = _stage(config)
+@pytest.mark.parametrize("config", CONFIGS)
+def test_a_pixel_that_loses_its_surface_pays_the_constant(config: str) -> None:
+    stage, state = _stage(CONFIGS[config])
     term, column = photometric_of(stage), 2
     gone, still = (figures_at(stage, s) for s in (_translated(state, [30.0, 0.0, 0.0]), state))
     lost = huber(torch.tensor(term.config.lost_grey_levels), term.config.huber_grey_levels).rho

@@ -5,11 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from directshape_torch.terms.robust import RobustValue, huber, identity, quadratic, truncated_huber
+from directshape_torch.terms.robust import RobustValue, huber, identity, quadratic
 
-RESIDUALS = torch.tensor(
-    [-40.0, -9.0001, -8.9999, -0.5, 0.0, 0.5, 8.9999, 9.0001, 14.9, 15.1, 40.0], dtype=torch.float64
-)
+RESIDUALS = torch.tensor([-40.0, -9.0001, -8.9999, -0.5, 0.0, 0.5, 8.9999, 9.0001, 40.0], dtype=torch.float64)
 
 
 def _check_weights(norm: RobustValue, residual: Tensor) -> None:
@@ -20,7 +18,7 @@ def _check_weights(norm: RobustValue, residual: Tensor) -> None:
 
 
 def test_weights_are_derivatives_of_the_value() -> None:
-    for norm in (quadratic, lambda r: huber(r, 9.0), lambda r: truncated_huber(r, 9.0, 15.0)):
+    for norm in (quadratic, lambda r: huber(r, 9.0)):
         residual = RESIDUALS.clone().requires_grad_()
         _check_weights(norm(residual), residual)
 
@@ -31,13 +29,6 @@ def test_huber_is_half_the_square_inside_and_linear_outside() -> None:
     assert norm.rho.tolist() == [8.0, 139.5]
     assert norm.gradient_weight.tolist() == [4.0, -9.0]
     assert norm.hessian_weight.tolist() == [1.0, 0.45]
-
-
-def test_the_truncated_norm_is_constant_beyond_its_limit() -> None:
-    norm = truncated_huber(torch.tensor([14.0, 15.0, 90.0], dtype=torch.float64), 9.0, 15.0)
-    assert norm.rho.tolist() == [9 * (14 - 4.5), 9 * (15 - 4.5), 9 * (15 - 4.5)]
-    assert norm.gradient_weight.tolist() == [9.0, 0.0, 0.0]
-    torch.testing.assert_close(norm.hessian_weight, torch.tensor([9 / 14, 0.0, 0.0], dtype=torch.float64))
 
 
 def test_identity_is_the_papers_reweighting_with_a_floor() -> None:
