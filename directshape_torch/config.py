@@ -333,16 +333,6 @@ class SamplingConfig(Settings):
 
 
 @dataclass(frozen=True)
-class SearchConfig(Settings):
-    """States tried before the first step; the cheapest one is kept (the input is always among them)."""
-
-    disparity_offsets_px: tuple[float, ...] = setting(
-        (), "the car is moved along its viewing ray by these disparities", at_least=-100, at_most=100
-    )
-    yaw_offsets_deg: tuple[float, ...] = setting((), "the car is turned by these angles", at_least=-360, at_most=360)
-
-
-@dataclass(frozen=True)
 class AcceptanceConfig(Settings):
     """Which results are returned; the input stands in for the others (status not_trusted or no_car)."""
 
@@ -390,7 +380,6 @@ class RefinerConfig(Settings):
     point_cloud: PointCloudConfig = field(default_factory=PointCloudConfig)
     priors: PriorConfig = field(default_factory=PriorConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
-    search: SearchConfig = field(default_factory=SearchConfig)
     rig: RigConfig = field(default_factory=RigConfig)
     tracks: TracksConfig = field(default_factory=TracksConfig)
     acceptance: AcceptanceConfig = field(default_factory=AcceptanceConfig)

@@ -29,7 +29,6 @@ from directshape_torch.refinement.tracks import refined
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.solver.gauss_newton import search_start
 from directshape_torch.terms.cars import CarBatch, CarState
 
 
@@ -278,9 +277,7 @@ class DirectShapeRefiner(nn.Module):
             from directshape_torch.refinement.box_alignment import align_boxes
 
             return align_boxes(problem, initial, cars, came)
-        with torch.no_grad():
-            start = search_start(problem, initial, cars.search_moves(self.config.search))
-        return refined(problem, cars, initial, start, came)
+        return refined(problem, cars, initial, came)
 
 
 def _config_cure(config: object) -> str:

@@ -64,7 +64,6 @@ OPTIONS: dict[str, tuple[str, ...]] = {
         "stages=[{contour_width_px: 2.0, image_level: 1, max_iterations: 6}, {contour_width_px: 0.5, image_level: 0, "
         "max_iterations: 6}]",
     ),
-    "search": ("search.disparity_offsets_px=[-2, 2]",),
     "geometric": ("method=geometric", "point_cloud.min_points=20"),
     "geometric joint": ("method=geometric", "point_cloud.order=joint", "point_cloud.min_points=20"),
     "combined": ("method=combined", "point_cloud.min_points=20"),

@@ -63,8 +63,6 @@ ABLATION = {
     "3000 pixels a car": "sampling.min_pixels=3000 sampling.max_pixels=3000",
     "fine stage only": f"'stages=[{_FINE}]'".replace("pose", "both"),
     "rays marched at every state": "solver.rays=marched",
-    "headings +-20 degrees, kept by cost": "search.yaw_offsets_deg=[-20,20]",
-    "disparities +-1, +-2 px, kept by cost": "search.disparity_offsets_px=[-2,-1,1,2]",
 }
 TABLES = {"pose": METHODS, "ablation": ABLATION}
 

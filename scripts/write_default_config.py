@@ -85,7 +85,7 @@ def _kind(hint: Any) -> str:
     if origin is typing.Literal:
         return "one of " + " | ".join(arguments)
     if origin is tuple:
-        return "list of numbers" if arguments[-1] is ... else f"list of {len(arguments)} numbers"
+        return f"list of {len(arguments)} numbers"
     kinds: dict[Any, str] = {float: "number", int: "whole number", bool: "true or false"}
     return kinds[hint]
 

@@ -11,9 +11,9 @@ import pytest
 
 from directshape_torch.config import (
     BackwardConfig,
+    PriorConfig,
     RefinerConfig,
     SamplingConfig,
-    SearchConfig,
     Settings,
     StageConfig,
 )
@@ -58,7 +58,7 @@ def test_where_none_is_near_an_unknown_key_names_all_of_its_group() -> None:
         ({"sampling": {"occlusion": 1}}, "sampling.occlusion: expected true or false, got 1"),
         ({"stages": {"a": 1}}, "stages: expected a list, got {'a': 1}"),
         ({"priors": {"dimensions_sigma_m": [0.1, 0.2]}}, "priors.dimensions_sigma_m: expected 3 entries"),
-        ({"search": {"yaw_offsets_deg": ["x"]}}, "search.yaw_offsets_deg[0]: expected a number"),
+        ({"priors": {"dimensions_sigma_m": ["x", 1, 1]}}, "priors.dimensions_sigma_m[0]: expected a number"),
         ({"silhouette": {"weight": None}}, "silhouette.weight: expected a number, got None"),
     ],
 )
@@ -110,8 +110,8 @@ def test_a_value_out_of_range_is_named(override: str, text: str) -> None:
         (lambda: RefinerConfig(compile=True), "compile: expected one of auto, on, off, got True"),  # type: ignore[arg-type]
         (lambda: SamplingConfig(density="5 %"), "density: expected a finite number, above 0 and at most 1, got '5 %'"),  # type: ignore[arg-type]
         (
-            lambda: dataclasses.replace(SearchConfig(), yaw_offsets_deg=(0.0, 400.0)),
-            "yaw_offsets_deg: expected a finite number, at least -360 and at most 360, got (0.0, 400.0)",
+            lambda: dataclasses.replace(PriorConfig(), dimensions_sigma_m=(0.1, 0.0, 0.4)),
+            "dimensions_sigma_m: expected a finite number, above 0, got (0.1, 0.0, 0.4)",
         ),
     ],
 )
@@ -124,7 +124,7 @@ def test_groups_made_in_python_are_checked_too(make: Callable[[], object], text:
 def test_every_setting_is_described_and_every_number_has_limits() -> None:
     config = RefinerConfig()
     groups = [x for x in vars(config).values() if isinstance(x, Settings)] + [config.stages[0]]
-    assert len(groups) == 12
+    assert len(groups) == 11
     settings = [(group, field) for group in groups for field in dataclasses.fields(group)]
     assert len(settings) > 60
     for group, field in settings:
@@ -141,8 +141,10 @@ def test_implicit_gradients_need_a_last_stage_at_rest() -> None:
 
 
 def test_round_trip() -> None:
-    config = load_config(None, ["silhouette.form=product", "search.yaw_offsets_deg=[-8, 8]", "solver.max_code=2"])
-    assert config.search.yaw_offsets_deg == (-8.0, 8.0)
+    config = load_config(
+        None, ["silhouette.form=product", "priors.dimensions_sigma_m=[0.2, 1, 3]", "solver.max_code=2"]
+    )
+    assert config.priors.dimensions_sigma_m == (0.2, 1.0, 3.0)
     assert config.solver.max_code == 2.0
     assert config_from_mapping(RefinerConfig, config_to_mapping(config)) == config
 

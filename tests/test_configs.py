@@ -71,7 +71,6 @@ def test_paper_has_the_weights_and_forms_of_the_paper() -> None:
     # What the paper does not have.
     assert config.photometric.brightness == "none"
     assert config.priors.dimensions_weight == 0
-    assert config.search.disparity_offsets_px == config.search.yaw_offsets_deg == ()
 
 
 def test_paper_anneals_the_contour_by_a_factor_of_07() -> None:

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.skipif(
 _TESTS = Path(__file__).parent
 _COMPARED = [
     "default",
-    "product form, marched rays, search",
+    "product form, marched rays",
     "point cloud",
     "implicit gradients",
     "neural prior, other residuals and priors, every step",

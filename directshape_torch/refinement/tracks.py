@@ -21,7 +21,7 @@ from directshape_torch.solver.gauss_newton import Minimum, minimise
 from directshape_torch.solver.problem import put_rows, take_rows, where_rows
 from directshape_torch.solver.sharing import Groups
 from directshape_torch.status import Status, is_refined
-from directshape_torch.terms.cars import CarBatch, CarState, following, retract
+from directshape_torch.terms.cars import CarBatch, CarState, retract
 from directshape_torch.terms.motion import NUM_PATH, hold_of_path, motion_terms, timed, with_path
 from directshape_torch.terms.next_view import NextView, NextViews
 from directshape_torch.terms.photometric import Photometric
@@ -34,23 +34,19 @@ _MORE_ITERATIONS = 2
 _IN_COMMON = 0.5
 
 
-def refined(
-    problem: CarProblem, cars: CarBatch, initial: CarState, start: CarState, came: RefinementResult
-) -> RefinementResult:
+def refined(problem: CarProblem, cars: CarBatch, initial: CarState, came: RefinementResult) -> RefinementResult:
     """The result of B cars, with the graph of the backward mode.
 
     Args:
         problem: of these cars, each by itself.
         cars: their tracks.
         initial: input states.
-        start: where the iterations begin, made of the input states by `search_start`.
         came: what is known of the cars beforehand.
     """
     unroll = torch.is_grad_enabled() and problem.config.backward.mode == "unroll"
-    minimum, found = _judged(problem, cars, initial, start, came)
-    origin = following(initial, start) if unroll else start
+    minimum, found = _judged(problem, cars, initial, initial, came)
     if cars.track_id is None:
-        return at_states(found, _attached(problem, cars, origin, minimum))
+        return at_states(found, _attached(problem, cars, initial, minimum))
     says = SaidOfShape.at(problem, minimum)
     doubtful = minimum.status == Status.not_trusted.code
     joins = (is_refined(minimum.status) | doubtful) & says.anything
@@ -59,7 +55,7 @@ def refined(
     while True:
         shared = together(problem, cars, minimum, parts)
         if shared is None:
-            return at_states(found, _attached(problem, cars, origin, minimum))
+            return at_states(found, _attached(problem, cars, initial, minimum))
         views, rows = cars.of_cars(shared.keep), shared.keep.nonzero()[:, 0]
         agreed = shared.agreed(take_rows(minimum.end, rows))
         before = shared.linked(take_rows(initial, rows))
@@ -81,7 +77,7 @@ def refined(
     chosen = is_refined(in_track.status).nonzero()[:, 0]
     stays = is_refined(minimum.status).index_fill(0, rows[chosen], False)
     # Where views began together has a part in gradients by repeated steps, in no others.
-    alone = _attached(problem, cars, origin, _at_ends(minimum, stays | shared.keep if unroll else stays))
+    alone = _attached(problem, cars, initial, _at_ends(minimum, stays | shared.keep if unroll else stays))
     # A track's steps depend on all of its views, trusted or not.
     of_all = _at_ends(in_track, torch.ones_like(rows, dtype=torch.bool))
     of_views = _attached(shared.problem, views, shared.agreed(take_rows(alone, rows)), of_all)

@@ -1,8 +1,7 @@
-"""The one loop: damped Gauss-Newton over a batch of independent problems, a status for each; and a search before it."""
+"""The one loop: damped Gauss-Newton over a batch of independent problems, a status for each."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic
 
@@ -221,29 +220,3 @@ def _read(ended: Tensor) -> list[int]:
     """How problems (B,) ended, read by the host: the only synchronisation of a block, at its end."""
     codes: list[int] = ended.tolist()
     return codes
-
-
-@full_precision()
-def search_start(
-    problem: Problem[StateT], initial: StateT, rounds: Sequence[Sequence[Callable[[StateT], StateT]]]
-) -> StateT:
-    """The cheapest of the input state and its moved copies, for each problem by itself, at the first stage's settings.
-
-    Args:
-        problem: B problems.
-        initial: their input states.
-        rounds: moves; those of each round start from the best state of the rounds before.
-    """
-    if not any(rounds):
-        return initial
-    seen = problem.look(initial)
-    stage = problem.begin(problem.stages()[0], seen)
-    best, best_cost = initial, stage.figures(seen).cost
-    for moves in rounds:
-        base = best
-        for move in moves:
-            candidate = move(base)
-            cost: Tensor = stage.figures(problem.look(candidate)).cost
-            cheaper = cost < best_cost
-            best, best_cost = where_rows(cheaper, candidate, best), torch.where(cheaper, cost, best_cost)
-    return best

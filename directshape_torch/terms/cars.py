@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from directshape_torch.config import SearchConfig
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.records import Record
 from directshape_torch.scene import Detections, FrameBatch
@@ -73,29 +70,6 @@ def move_by_disparity(state: CarState, focal_baseline: Tensor, offset_px: float 
     scale = disparity / (disparity + offset_px).clamp_min(0.1)
     moved = se3.from_rotation_translation(T_cam_obj[:, :3, :3], origin * scale[:, None])
     return state._replace(T_obj_cam=se3.inverse(moved))
-
-
-def turn(state: CarState, angle_rad: float) -> CarState:
-    """Cars turned about the vertical axis of their own object frame."""
-    twist = torch.zeros(6, dtype=state.code.dtype, device=state.code.device)
-    twist[4] = angle_rad
-    return state._replace(T_obj_cam=se3.exp(twist) @ state.T_obj_cam)
-
-
-def following(initial: CarState, start: CarState) -> CarState:
-    """The state that `search_moves` made of the input, as a function of it: moved by a disparity, turned by an angle.
-
-    Both are constants. A disparity moves the origin along its viewing ray, `origin / (1 + a z)` with `a` the disparity
-    over focal length and baseline; an angle turns the car about itself.
-    """
-    origin, chosen = (se3.inverse(state.T_obj_cam)[:, :3, 3] for state in (initial, start))
-    here = origin.detach()
-    a = (here[:, 2] / chosen[:, 2].detach() - 1) / here[:, 2]
-    moved = origin / (1 + a * origin[:, 2])[:, None]
-    R_obj_cam = initial.T_obj_cam[:, :3, :3]
-    turn = (start.T_obj_cam[:, :3, :3] @ R_obj_cam.mT).detach()
-    R_moved = turn @ R_obj_cam
-    return start._replace(T_obj_cam=se3.from_rotation_translation(R_moved, -(R_moved @ moved[..., None])[..., 0]))
 
 
 @dataclass(frozen=True)
@@ -185,14 +159,6 @@ class CarBatch(Record):
         assert self.offset_sigma_px is not None
         per_px = torch.where(self.offset_sigma_px > 0, 1 / self.focal_baseline, 0.0)
         return offset_px * per_px[:, None]
-
-    def search_moves(self, config: SearchConfig) -> list[list[Callable[[CarState], CarState]]]:
-        """Moves of the cars to try before the first step: disparities, then headings."""
-        moves, turns = config.disparity_offsets_px, config.yaw_offsets_deg
-        return [
-            [partial(move_by_disparity, focal_baseline=self.focal_baseline, offset_px=offset) for offset in moves],
-            [partial(turn, angle_rad=math.radians(angle)) for angle in turns],
-        ]
 
     def of_cars(self, keep: Tensor, numbers: Sequence[int] | None = None) -> CarBatch:
         """Those of the cars where `keep` (B,) holds: `numbers` of them, should the host know it, who waits if not."""

@@ -17,10 +17,10 @@ from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.solver.gauss_newton import Minimum, minimise, search_start
+from directshape_torch.solver.gauss_newton import Minimum, minimise
 from directshape_torch.solver.problem import put_rows, where_rows
 from directshape_torch.status import Status
-from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.terms.cars import CarState
 from directshape_torch.visualize.residuals import CarResiduals, car_residuals
 
 
@@ -32,7 +32,7 @@ class RefinementTrace:
     result: RefinementResult
     # (N + 1) states of all B cars. A car that is done, or never took part, keeps its state.
     states: tuple[CarState, ...]
-    # (N + 1) number of the stage that led to each state; -1 for the input and the start of a search.
+    # (N + 1) number of the stage that led to each state; -1 for the input.
     stage: tuple[int, ...]
     accepted: Tensor  # (N + 1, B) bool: the step to this state was taken
     # (N + 1, B, T) of each term, all at the pixel sets and sharpness of the final stage, so that they can be compared;
@@ -101,19 +101,16 @@ def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections
     everyone, inputs = refiner.problem(frames, detections)
     problem, initial = everyone.of_problems(took_part), CarState(*(x[rows] for x in inputs))
     with full_precision(), compiling(refiner.config.compile, len(detections)):
-        cars = CarBatch.from_scene(frames, detections).of_cars(took_part)
-        start = search_start(problem, initial, cars.search_moves(refiner.config.search))
-        minimum = minimise(problem, initial, refiner.config.solver, start, record=True)
-        states = [initial, *([] if start is initial else [start]), *_ends(minimum)]
+        minimum = minimise(problem, initial, refiner.config.solver, record=True)
+        states = [initial, *_ends(minimum)]
         costs = torch.stack([minimum.stage.figures(problem.look(state)).term_costs for state in states])
-    before = len(states) - len(minimum.trajectory)
     none = torch.zeros_like(took_part)
     accepted = [none.index_copy(0, rows, iteration.accepted) for iteration in minimum.trajectory]
     return RefinementTrace(
         result,
         tuple(put_rows(inputs, rows, state) for state in states),
-        (-1,) * before + tuple(iteration.stage for iteration in minimum.trajectory),
-        torch.stack([none] * before + accepted),
+        (-1, *(iteration.stage for iteration in minimum.trajectory)),
+        torch.stack([none, *accepted]),
         costs.new_full((len(costs), len(detections), costs.shape[2]), torch.nan).index_copy(1, rows, costs),
         rows,
         minimum.stage,

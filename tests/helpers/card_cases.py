@@ -41,13 +41,8 @@ _SIGMAS = {"pose_sigma_along_m": 0.5, "pose_sigma_across_m": 0.3, "pose_sigma_ve
 
 SETTINGS: dict[str, RefinerConfig] = {
     "default": _SHIPPED,
-    "product form, marched rays, search": with_solver(
-        replace(
-            _FEW_STEPS,
-            silhouette=replace(DEFAULT.silhouette, form="product"),
-            search=replace(DEFAULT.search, disparity_offsets_px=(-1.0, 1.0)),
-        ),
-        rays="marched",
+    "product form, marched rays": with_solver(
+        replace(_FEW_STEPS, silhouette=replace(DEFAULT.silhouette, form="product")), rays="marched"
     ),
     "point cloud": replace(DEFAULT, method="geometric", point_cloud=replace(DEFAULT.point_cloud, rounds=2)),
     "implicit gradients": replace(DEFAULT, backward=replace(DEFAULT.backward, mode="implicit")),

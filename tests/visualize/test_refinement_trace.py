@@ -16,8 +16,6 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections
 from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
 
-_SEARCH = "search.disparity_offsets_px=[-2,2]"
-
 
 @pytest.fixture(scope="module")
 def demo_frame() -> LoadedFrame:
@@ -32,9 +30,9 @@ def _with_lost_car(detections: Detections) -> Detections:
     return replace(detections, T_cam_obj=T_cam_obj)
 
 
-@pytest.fixture(scope="module", params=[[], ["method=geometric"], [_SEARCH]], ids=["direct", "geometric", "search"])
+@pytest.fixture(scope="module", params=["direct", "geometric"])
 def trace(request: pytest.FixtureRequest, demo_frame: LoadedFrame) -> RefinementTrace:
-    refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off", *IMAGES_ALONE, *request.param]))
+    refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off", *IMAGES_ALONE, f"method={request.param}"]))
     return trace_refinement(refiner, demo_frame.frame, _with_lost_car(demo_frame.detections))
 
 
@@ -69,7 +67,7 @@ def test_cars_move_where_a_step_was_accepted_and_nowhere_else(trace: RefinementT
     for car in trace.rows.tolist():
         for k in range(1, len(trace)):
             same = all(torch.equal(a[car], b[car]) for a, b in zip(trace.states[k], trace.states[k - 1], strict=True))
-            assert same or trace.accepted[k, car] or trace.stage[k] == -1
+            assert same or trace.accepted[k, car]
         assert trace.steps_of(car)[0] == 0
         assert trace.steps_of(car)[-1] == len(trace) - 1
 
@@ -81,9 +79,3 @@ def test_no_cars_at_all(demo_frame: LoadedFrame) -> None:
     trace = trace_refinement(refiner, demo_frame.frame, replace(demo_frame.detections, T_cam_obj=T_cam_obj))
     assert len(trace) == len(trace.costs) == 1
     assert len(trace.rows) == 0
-
-
-def test_search_adds_the_start_that_it_chose(demo_frame: LoadedFrame) -> None:
-    config = load_config("fast", ["compile=off", _SEARCH, "stages=[{max_iterations: 1}]"])
-    trace = trace_refinement(DirectShapeRefiner(config=config), demo_frame.frame, demo_frame.detections)
-    assert trace.stage == (-1, -1, 0)
