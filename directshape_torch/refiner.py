@@ -23,13 +23,13 @@ from directshape_torch.observation.refinable import check_fit, check_no_tangents
 from directshape_torch.refinement.fusion import UNKNOWN_DETECTOR, fused, noise_of_boxes
 from directshape_torch.refinement.outcome import as_they_came
 from directshape_torch.refinement.problem import CarProblem
+from directshape_torch.refinement.refined import Refined
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.scene_problem import TermFactory, problem_of_scene
-from directshape_torch.refinement.tracks import refined
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.state.cars import CarBatch, CarState
 
 
 class KnownRig(Protocol):
@@ -277,7 +277,13 @@ class DirectShapeRefiner(nn.Module):
             from directshape_torch.refinement.box_alignment import align_boxes
 
             return align_boxes(problem, initial, cars, came)
-        return refined(problem, cars, initial, came)
+        alone = Refined.of(problem, cars, initial, initial, came)
+        if cars.track_id is None:
+            return alone.result(initial)
+        # Here, for cars by themselves need nothing of it.
+        from directshape_torch.tracks.share import brought_together
+
+        return brought_together(alone, initial, came)
 
 
 def _config_cure(config: object) -> str:

@@ -2,36 +2,30 @@
 
     python examples/upright_prior.py
 
-A residual of the cars and their state with its Jacobian is all that a prior needs (docs/extra_terms.md).
+A residual of the cars and their state is all that a prior needs (docs/extra_terms.md).
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import torch
+from torch import Tensor
 
 import directshape_torch
 from directshape_torch import DirectShapeRefiner, RefinementResult
 from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.terms.cars import CarBatch, CarState
-from directshape_torch.terms.priors import PriorResidual, PriorTerm
+from directshape_torch.state.cars import CarBatch
+from directshape_torch.state.unknowns import State
+from directshape_torch.terms.priors import PriorTerm
 
 ROOT = Path(directshape_torch.__file__).parent / "assets" / "demo"
 
 
-def upright(cars: CarBatch, state: CarState) -> PriorResidual:
-    """Sines of pitch and roll: what the camera's y axis, seen from the car, has along the car's x and z axes.
-
-    The axis `a = R_obj_cam e_y` turns with the object frame, `da = omega x a`.
-    """
-    x, y, z = state.T_obj_cam[:, :3, 1].unbind(-1)
-    zero = torch.zeros_like(x)
-    J_x, J_z = torch.stack([zero, z, -y], dim=-1), torch.stack([y, -x, zero], dim=-1)
-    J_state = torch.nn.functional.pad(torch.stack([J_x, J_z], dim=1), (3, state.code.shape[1]))
-    return PriorResidual(torch.stack([x, z], dim=-1), J_state)
+def upright(cars: CarBatch, state: State) -> Tensor:
+    """Sines of pitch and roll: what the camera's y axis, seen from the car, has along the car's x and z axes."""
+    return state.T_obj_cam[:, [0, 2], 1]
 
 
 def upright_prior(frames: FrameBatch, detections: Detections, cars: CarBatch, prior: ShapePrior) -> PriorTerm:

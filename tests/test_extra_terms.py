@@ -22,9 +22,10 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rows import Blocks
 from directshape_torch.scene import Detections
 from directshape_torch.shape.field import Field
+from directshape_torch.state.cars import CarBatch, CarState
+from directshape_torch.state.unknowns import POSE
 from directshape_torch.status import Status
 from directshape_torch.terms.car_points import car_points
-from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.point_cloud import PointCloud
 from directshape_torch.terms.priors import PriorResidual, PriorTerm, height_prior
 from directshape_torch.terms.robust import RobustValue, quadratic
@@ -42,7 +43,7 @@ def lower_by(metres: Tensor | float) -> Callable[[CarBatch, CarState], PriorResi
 
 
 def made(kind: type[PriorTerm] = PriorTerm, residual_of: Any = None, weight: float = 1e5) -> TermFactory:
-    return lambda *scene: kind("user", weight, scene[2], residual_of or lower_by(0.1), 1)
+    return lambda *scene: kind("user", weight, scene[2], residual_of or lower_by(0.1), 1, (POSE,))
 
 
 def refine(
@@ -177,9 +178,9 @@ BROKEN: dict[str, tuple[dict[str, Any], str]] = {
         {"linear": _linear(J_residual_inner=lambda x: x[:1])},
         r"linear\(...\).J_residual_inner: expected shape \(2, 1, 1\), got \(1, 1, 1\)",
     ),
-    "a Jacobian without the code": (
-        {"linear": _linear(J_inner_state=lambda x: x[..., :6])},
-        r"linear\(...\).J_inner_state: expected shape \(2, 1, 9\), got \(2, 1, 6\); by \(v, omega, dcode\)",
+    "a Jacobian without the rotation": (
+        {"linear": _linear(J_inner_state=lambda x: x[..., :3])},
+        r"linear\(...\).J_inner_state: expected shape \(2, 1, 6\), got \(2, 1, 3\); by pose",
     ),
     "no Linear": ({"linear": lambda *_: torch.zeros(2)}, r"linear\(...\): expected a Linear, got Tensor"),
     "another residual": (
@@ -219,7 +220,7 @@ def test_a_member_that_is_missing_is_named() -> None:
         refine(lambda *_: Bare())  # type: ignore[arg-type, return-value]
 
 
-REQUIRED = ("names", "blocks", "block_weight", "information", "row_weight", "linear", "residual", "norm", "of_cars")
+REQUIRED = ("names", "blocks", "block_weight", "information", "row_weight", "residual", "norm", "of_cars")
 
 
 @pytest.mark.parametrize("name", REQUIRED)
@@ -240,6 +241,7 @@ class LowerTerm(Term):
     block_weight: Tensor
     column: Tensor
     row_weight: Tensor
+    sees = (POSE,)
 
     @property
     def information(self) -> Tensor:
@@ -269,9 +271,42 @@ def test_members_may_be_fields_of_a_dataclass() -> None:
     with pytest.raises(TypeError, match="6 required positional arguments"):
         LowerTerm()  # type: ignore[call-arg]
     by_fields = refine(lambda *scene: LowerTerm.of("user", scene[2]))
-    by_properties = refine(lambda *scene: PriorTerm("user", 1e5, scene[2], lower_by(0.1), 1, is_prior=False))
+    by_properties = refine(lambda *scene: PriorTerm("user", 1e5, scene[2], lower_by(0.1), 1, (POSE,), is_prior=False))
     torch.testing.assert_close(by_fields.T_cam_obj, by_properties.T_cam_obj, rtol=0, atol=0)
     torch.testing.assert_close(by_fields.covariance, by_properties.covariance, rtol=0, atol=0)
+
+
+def test_a_residual_without_a_jacobian_is_differentiated() -> None:
+    """By itself, and as that of a term without `linear`, to the last digits of what hand-derived ones give."""
+    by_hand = refine(made())
+
+    def height(cars: CarBatch, state: CarState) -> Tensor:
+        return lower_by(0.1)(cars, state).residual
+
+    alone = refine(made(residual_of=height))
+    of_term = refine(lambda *scene: ResidualTerm.of("user", scene[2]))
+    measured = refine(lambda *scene: LowerTerm.of("user", scene[2]))
+    for found, expected in ((alone, by_hand), (of_term, measured)):
+        torch.testing.assert_close(found.T_cam_obj, expected.T_cam_obj, rtol=0, atol=1e-9)
+        torch.testing.assert_close(found.covariance, expected.covariance, rtol=1e-6, atol=1e-12)
+
+
+class ResidualTerm(LowerTerm):
+    """The residual alone."""
+
+    linear = Term.linear
+
+
+class TwoToARow(ResidualTerm):
+    """Two residuals in each row, which have one inner scalar only if somebody says which."""
+
+    def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
+        return super().residual(field, state, where).expand(-1, -1, 2)
+
+
+def test_two_residuals_of_a_row_need_a_jacobian_by_hand() -> None:
+    with pytest.raises(InputError, match=r"'user': residual\(...\): expected one residual a row.*write linear"):
+        refine(lambda *scene: TwoToARow.of("user", scene[2]))
 
 
 class TensorTerm(LowerTerm):
@@ -289,8 +324,6 @@ def test_one_tensor_says_where_rows_look() -> None:
 def test_two_terms_of_one_name_are_named() -> None:
     with pytest.raises(InputError, match=r"extra term 'user': names: expected names that no other column has"):
         refine(made(), made())
-    with pytest.raises(InputError, match=r"extra term 'path': names: expected names that no other column has"):
-        refine(lambda *scene: PriorTerm("path", 1.0, scene[2], lower_by(0.1), 1))
 
 
 def _poisoned(name: str, when: Callable[[CarState], Tensor]) -> Callable[[CarBatch, CarState], PriorResidual]:

@@ -28,7 +28,7 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.solver.gauss_newton import Minimum, minimise
-from directshape_torch.terms.cars import CarState, retract
+from directshape_torch.state.cars import CarState
 from directshape_torch.terms.term import Figures
 
 DEMO = Path(__file__).parents[1] / "directshape_torch" / "assets" / "demo"
@@ -69,7 +69,8 @@ def _gradient_error(stage: CarStage, state: CarState, names: tuple[str, ...]) ->
         for unknown in range(analytic.shape[1]):
             delta = torch.zeros_like(analytic)
             delta[:, unknown] = step
-            ends = [figures_at(stage, retract(state, sign * delta)).term_costs[:, of_terms].sum(1) for sign in (1, -1)]
+            both = [state.unknowns.retract(state, sign * delta) for sign in (1, -1)]
+            ends = [figures_at(stage, at).term_costs[:, of_terms].sum(1) for at in both]
             numeric[:, unknown] = (ends[0] - ends[1]) / (2 * step)
         errors.append((numeric - analytic).norm(dim=1) / analytic.norm(dim=1).clamp_min(1e-9))
     return torch.minimum(*errors)

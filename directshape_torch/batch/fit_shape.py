@@ -23,8 +23,8 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rows import PointSamples
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.state.cars import CarBatch
 from directshape_torch.status import Status
-from directshape_torch.terms.cars import CarBatch
 from directshape_torch.terms.point_cloud import PointCloud
 
 # Every car is fitted as seen by a camera of its own, which stands 10 m from it and 1.65 m above the ground of its box.

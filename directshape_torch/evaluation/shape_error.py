@@ -21,7 +21,7 @@ from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.mask_matching import match_masks
 from directshape_torch.refinement.ray_cast import cast
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.terms.cars import CarState
+from directshape_torch.state.cars import CarState
 
 Points = NDArray[np.float64]
 

@@ -14,22 +14,23 @@ from directshape_torch.laboratory.regimes import Draw, Regime, seeded
 from directshape_torch.laboratory.scenes import LaboratoryScene
 from directshape_torch.numerics.tensors import length, occurrences
 from directshape_torch.observation.packing import Observation, pack_pixels
-from directshape_torch.refinement.one_car import own_and_shared
 from directshape_torch.refinement.problem import CarProblem, CarStage
 from directshape_torch.refinement.scene_problem import TermFactory, problem_of_scene
-from directshape_torch.refinement.tracks import in_tracks
 from directshape_torch.rows import PixelSamples, PointSamples, Rays, Rows
 from directshape_torch.scene import Detections
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.solver.sharing import Groups
-from directshape_torch.terms.cars import CarBatch, CarState, retract
+from directshape_torch.state.cars import CarBatch, CarState
+from directshape_torch.state.unknowns import State
 from directshape_torch.terms.check_term import car_products, check_same
 from directshape_torch.terms.depth import closest_of_march, first_hits, march
-from directshape_torch.terms.motion import MOTION_NAMES, timed
-from directshape_torch.terms.next_view import NEXT_VIEW_NAME
 from directshape_torch.terms.silhouette import contour_zeta
 from directshape_torch.terms.term import Linear, Sight, Term, linear_of
+from directshape_torch.tracks.next_view import NEXT_VIEW_NAME
+from directshape_torch.tracks.path import MOTION_NAMES, timed
+from directshape_torch.tracks.share import in_tracks
+from directshape_torch.tracks.state import TrackState, own_and_shared
 
 TERM_NAMES = (
     "silhouettes", "silhouettes_product", "photometric", "point_cloud",
@@ -53,7 +54,7 @@ class Bench:
     regime: Regime  # that they were drawn from
     stage: CarStage  # of the problem with the default settings, a pose prior, points and the user's own terms, begun
     terms: Mapping[str, Term]  # by the laboratory's names, in all forms, the paper's among them
-    state: CarState  # of the B cars
+    state: CarState | TrackState  # of the B cars
     sight: Sight  # what the rays see of it
     rows: Mapping[str, Linear]  # residuals and factors of each term at that state
 
@@ -63,7 +64,7 @@ class Bench:
 
     @property
     def num_unknowns(self) -> int:
-        return self.state.num_unknowns
+        return self.state.unknowns.size
 
     @property
     def rays_per_car(self) -> Tensor:
@@ -71,9 +72,9 @@ class Bench:
         masks, count = self.problem.masks, torch.zeros_like(self.state.code[:, 0])
         return count.index_add(0, masks.rays.owner, masks.filled.sum(dim=1))
 
-    def moved(self, delta: Tensor) -> CarState:
+    def moved(self, delta: Tensor) -> CarState | TrackState:
         """All cars moved by one tangent vector (D,)."""
-        return retract(self.state, delta.expand(len(self.state.code), self.num_unknowns))
+        return self.state.unknowns.retract(self.state, delta.expand(len(self.state.code), self.num_unknowns))
 
     @classmethod
     def build(
@@ -107,8 +108,8 @@ class Bench:
         stages = []
         for c in (config, other_forms):
             problem = problem_of_scene(c, prior, frame, detections, cars, seen, own_terms)
-            if drawn.state.path.shape[1]:
-                problem = _of_a_track(problem, cars, drawn.state)
+            if isinstance(drawn.state, TrackState):
+                problem = _of_a_track(problem, cars, drawn.state.alone)
             stages.append(problem.begin(c.stages[regime.stage], problem.look(start)))
         if own_terms:
             _check_refused(config, prior, scene, detections, cars, seen, own_terms)
@@ -180,7 +181,7 @@ def _of_a_track(problem: CarProblem, cars: CarBatch, state: CarState) -> CarProb
     number = torch.arange(len(cars))
     time_s = 0.1 * number.to(state.code)
     T_world_cam = se3.exp(time_s[:, None] * time_s.new_tensor([0.5, 0.0, 10.0, 0.0, 0.2, 0.0]))
-    sharing = Groups.of([0] * len(cars), *own_and_shared(problem, state.code.device))
+    sharing = Groups.of([0] * len(cars), *own_and_shared(state))
     views = timed(sharing, replace(cars, time_s=time_s, T_world_cam=T_world_cam))
     return in_tracks(problem, sharing, views, state, sharing.everybody, (number + 1).clamp_max(len(cars) - 1))
 
@@ -195,7 +196,7 @@ def _named(stage: CarStage, other_forms: CarStage) -> dict[str, Term]:
     return {name: plain.pop(name) for name in TERM_NAMES} | plain
 
 
-def _points(pixels: PixelSamples, state: CarState, generator: torch.Generator) -> PointSamples:
+def _points(pixels: PixelSamples, state: State, generator: torch.Generator) -> PointSamples:
     """A point beside the middle of its car, on the ray of each left pixel."""
     car = pixels.object_index
     depth = se3.inverse(state.T_obj_cam)[car, 2, 3]
@@ -208,7 +209,7 @@ def _chosen(
     observation: Observation,
     regime: Regime,
     prior: PCAShapePrior,
-    state: CarState,
+    state: State,
     cars: CarBatch,
     config: RefinerConfig,
     pixels_per_car: int,

@@ -18,8 +18,9 @@ from directshape_torch.laboratory.scenes import LaboratoryScene, place_cars, sel
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections
 from directshape_torch.shape.pca_prior import PCAShapePrior
-from directshape_torch.terms.cars import CarState, retract
-from directshape_torch.terms.motion import NUM_PATH
+from directshape_torch.state.cars import CarState
+from directshape_torch.tracks.path import NUM_PATH
+from directshape_torch.tracks.state import TrackState
 
 Pixels = Literal["sampled", "contour", "grazing", "grid_border"]
 _GROUND_Y_M = 1.65
@@ -29,7 +30,7 @@ class DrawnStates(NamedTuple):
     """B states with the detections whose pixels they are judged by."""
 
     detections: Detections
-    state: CarState
+    state: CarState | TrackState
 
 
 class Draw(NamedTuple):
@@ -54,7 +55,7 @@ class Draw(NamedTuple):
         delta = torch.randn(count, 6, generator=self.generator, dtype=torch.float64)
         delta = delta * torch.tensor([metres] * 3 + [math.radians(degrees)] * 3, dtype=torch.float64)
         change = sigma * torch.randn(count, num_codes, generator=self.generator, dtype=torch.float64)
-        return retract(state, torch.cat([delta, change], dim=1), max_code=3.0)
+        return state.unknowns.retract(state, torch.cat([delta, change], dim=1), max_code=3.0)
 
     def of_frame(self, T_cam_obj: Tensor, code: Tensor, metres: float, degrees: float, sigma: float) -> DrawnStates:
         """The detections of the frame, over and over, at states about the given ones of each."""
@@ -141,8 +142,8 @@ def _track(d: Draw) -> DrawnStates:
     d = d._replace(num_states=max(2, d.num_states))  # one view has no path
     drawn = d.of_frame(detections.T_cam_obj[:1], d.prior.initial_code(1), 0.15, 2.0, 0.8)
     path = torch.randn(1, NUM_PATH, generator=d.generator, dtype=torch.float64).repeat(d.num_states, 1)
-    T_obj_next = drawn.state.T_obj_cam.roll(-1, 0)[:, None]
-    return drawn._replace(state=drawn.state._replace(path=path, T_obj_next=T_obj_next))
+    alone = drawn.state
+    return drawn._replace(state=TrackState(*alone[:3], path, alone.T_obj_cam.roll(-1, 0)[:, None]))
 
 
 def _with_code(size: float) -> Callable[[Draw], DrawnStates]:

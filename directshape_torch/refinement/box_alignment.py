@@ -26,8 +26,8 @@ from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.rows import CarSums, ObjectRays, Rays
 from directshape_torch.solver.problem import where_rows
+from directshape_torch.state.cars import CarBatch, CarState, move_by_disparity
 from directshape_torch.status import Status
-from directshape_torch.terms.cars import CarBatch, CarState, move_by_disparity
 from directshape_torch.terms.depth import Hits
 from directshape_torch.terms.photometric import Photometric, Surface
 

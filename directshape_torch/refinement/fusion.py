@@ -20,7 +20,8 @@ from directshape_torch.refinement.observability import HEADING_LEVER_M, quantiti
 from directshape_torch.refinement.trust import ImageNoise, probabilities
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.shape.zero_level import zero_level_extents
-from directshape_torch.terms.cars import CarBatch, CarState, retract
+from directshape_torch.state.cars import CarBatch, CarState
+from directshape_torch.state.unknowns import CODE, POSE, Unknowns
 
 if TYPE_CHECKING:
     from directshape_torch.refinement.result import RefinementResult
@@ -137,15 +138,17 @@ def fused(result: RefinementResult, detections: Detections) -> RefinementResult:
         J = quantities_jacobian(own.prior, _state(own))
     # The first step is linear, which sizes in the code are not; the second one takes what is left.
     target = (gain @ difference[..., None])[..., 0]
-    first = retract(_state(own), _least_step(J, target))
+    state = _state(own)
+    unknowns = state.unknowns
+    first = unknowns.retract(state, _least_step(unknowns, J, target))
     left = target - (difference - _difference(_at(own, first), *boxes))
-    moved = _at(own, retract(first, _least_step(J, left)))
+    moved = _at(own, unknowns.retract(first, _least_step(unknowns, J, left)))
     T_cam_obj = result.T_cam_obj.index_copy(0, rows, moved.T_cam_obj)
     return replace(result, T_cam_obj=T_cam_obj, code=result.code.index_copy(0, rows, moved.code))
 
 
-def _least_step(J: Tensor, change: Tensor) -> Tensor:
-    """The least step (R, D) of the tangent of `retract` that changes the quantities by so much (R, 7).
+def _least_step(unknowns: Unknowns, J: Tensor, change: Tensor) -> Tensor:
+    """The least step (R, D) of the unknowns that changes the quantities by so much (R, 7).
 
     The pose changes place and heading; the shape, whose unit is its own standard deviation, changes the sizes.
     """
@@ -155,7 +158,8 @@ def _least_step(J: Tensor, change: Tensor) -> Tensor:
         step: Tensor = (J.mT @ torch.linalg.solve_ex(J @ J.mT + ridge, change[..., None])[0])[..., 0]
         return step
 
-    return torch.cat([solved(J[:, :4, :6], change[:, :4]), solved(J[:, 4:, 6:], change[:, 4:])], dim=1)
+    parts = (POSE, slice(0, 4)), (CODE, slice(4, 7))
+    return torch.cat([solved(J[:, rows, unknowns.span(name)], change[:, rows]) for name, rows in parts], dim=1)
 
 
 def _state(result: RefinementResult) -> CarState:

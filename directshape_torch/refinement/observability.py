@@ -15,7 +15,7 @@ from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_p
 from directshape_torch.numerics.records import CarRecord, Dense
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.terms.cars import CarState
+from directshape_torch.state.unknowns import State
 
 CAR_QUANTITIES = ("depth", "sideways position", "height above ground", "heading", "length", "width", "height")
 """The quantities (7) that a direction is made of; all in metres.
@@ -91,7 +91,7 @@ def direction_in_words(direction: Sequence[float]) -> str:
 
 
 def covariance_of(fisher: Tensor) -> Tensor:
-    """Inverse Fisher information (B, D, D) in the tangent of `retract`, without damping; NaN where it is singular.
+    """Inverse Fisher information (B, D, D) in the tangent of the state, without damping; NaN where it is singular.
 
     Silhouette pixels count with weight 1 (not the solver's 1/r), sums run over effective pixels (not means). It is
     uncalibrated: multiply by the s^2 fitted on data with ground truth.
@@ -104,14 +104,15 @@ def covariance_of(fisher: Tensor) -> Tensor:
     return torch.where(regular[:, None, None], covariance, torch.nan)
 
 
-def without_offset(information: Tensor, num_kept: int) -> Tensor:
-    """The information (B, 6 + K, 6 + K) on pose and shape, whatever the offset is, from that on all unknowns (B, D, D).
+def without_offset(information: Tensor, kept: slice) -> Tensor:
+    """The information on the first unknowns, `kept`, whatever the others are, from that on all (B, D, D).
 
     Schur's complement; an offset of which nothing is known has nothing to share.
     """
-    of_offset = information.diagonal(dim1=1, dim2=2)[:, None, num_kept:]
-    across = information[:, :num_kept, num_kept:] / torch.where(of_offset > 0, of_offset, 1.0)
-    return information[:, :num_kept, :num_kept] - across @ information[:, num_kept:, :num_kept]
+    others = slice(kept.stop, None)
+    of_others = information.diagonal(dim1=1, dim2=2)[:, None, others]
+    across = information[:, kept, others] / torch.where(of_others > 0, of_others, 1.0)
+    return information[:, kept, kept] - across @ information[:, others, kept]
 
 
 def covariance_xyz_yaw(
@@ -131,7 +132,7 @@ def _towards(location: Tensor) -> Tensor:
     return viewing_axes(location) * constant_like((1.0, 1.0, -1.0), location)[:, None]
 
 
-def observability_of(prior: ShapePrior, state: CarState, seen: Tensor | None) -> Observability:
+def observability_of(prior: ShapePrior, state: State, seen: Tensor | None) -> Observability:
     """Principal directions of the car's quantities under the information (B, D, D) of the terms that are no priors."""
     T_cam_obj = se3.inverse(state.T_obj_cam)
     alpha = alpha_from_kitti(T_cam_obj[:, :3, 3], rotation_y_from_pose(T_cam_obj)).to(torch.float64)
@@ -141,8 +142,8 @@ def observability_of(prior: ShapePrior, state: CarState, seen: Tensor | None) ->
     return Observability(sigmas, directions, alpha)
 
 
-def quantities_jacobian(prior: ShapePrior, state: CarState) -> Tensor:
-    """J (B, 7, D) of `CAR_QUANTITIES` by the tangent of `retract`.
+def quantities_jacobian(prior: ShapePrior, state: State) -> Tensor:
+    """J (B, 7, D) of `CAR_QUANTITIES` by the tangent `(v, omega, dcode)` of the state.
 
     The object origin, in the middle of the footprint, moves by `-R_cam_obj v`; `rotation_y` by `-R_cam_obj[1] omega`.
     """

@@ -32,8 +32,9 @@ from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.solver.sharing import INDEPENDENT
+from directshape_torch.state.cars import CarBatch
+from directshape_torch.state.unknowns import CODE, POSE, AnyState, State, Unknowns, blocks_of_car
 from directshape_torch.status import Status, is_refined
-from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.priors import RIG_WEIGHT
 from directshape_torch.terms.term import Evaluation, Figures
 
@@ -59,7 +60,12 @@ def as_they_came(
     """The result of B cars of which nothing is known but what they came with, and the statuses (B,) that say so."""
     count, T_cam_obj = len(detections), detections.T_cam_obj.clone()
     offsets = default_offsets(T_cam_obj)
-    sizes: dict[int | str, int] = {"B": count, "D": 6 + prior.num_codes, "T": len(term_names), "iterations": 0}
+    sizes: dict[int | str, int] = {
+        "B": count,
+        "D": Unknowns(blocks_of_car(prior.num_codes, 0)).size,
+        "T": len(term_names),
+        "iterations": 0,
+    }
     sizes |= {"E": len(EVIDENCE_NAMES), "n": len(offsets)}
     return RefinementResult.nothing(
         sizes,
@@ -103,7 +109,7 @@ def going_on(result: RefinementResult, rows: Tensor, later: RefinementResult) ->
     return replace(result, iterations=done, cost_history=history)
 
 
-def at_states(result: RefinementResult, state: CarState) -> RefinementResult:
+def at_states(result: RefinementResult, state: State) -> RefinementResult:
     """The result at its final states; what is said of a car that is not there is not known."""
     status, refined = result.status_code, result.refined
     figures_known = refined | torch.stack([status == each.code for each in _REFUSED]).any(dim=0)
@@ -126,7 +132,7 @@ def at_states(result: RefinementResult, state: CarState) -> RefinementResult:
 
 
 def outcome_of(
-    problem: CarProblem, minimum: Minimum[CarState], cars: CarBatch, came: RefinementResult
+    problem: CarProblem, minimum: Minimum[AnyState], cars: CarBatch, came: RefinementResult
 ) -> RefinementResult:
     """What `came` becomes at a minimum: costs, covariance, quality, observability and profile.
 
@@ -136,14 +142,14 @@ def outcome_of(
     end, refined = minimum.end, is_refined(minimum.status)
     stage: CarStage = minimum.stage
     before, after = minimum.before, _of_calibrated_rig(problem, minimum.after)
-    num_kept = 6 + end.code.shape[1]
+    kept = end.unknowns.span(POSE, CODE)
     # What the other views of a track say of its shape.
     information = problem.sharing.with_others(after.information.sum(dim=1), refined)
-    covariance = covariance_of(information)[:, :num_kept, :num_kept] + _of_field(end, cars)
+    covariance = covariance_of(information)[:, kept, kept] + _of_field(end, cars)
     at_input, at_end = (None if at is None else at.where for at in map(stage.photometric_part, (before, after)))
     seen = stage.information_of_measurements(after)
     if seen is not None:
-        seen = without_offset(problem.sharing.with_others(seen, refined), num_kept)
+        seen = without_offset(problem.sharing.with_others(seen, refined), kept)
     unseen = observability_of(problem.prior, end, seen)
     found = replace(
         came,
@@ -167,7 +173,7 @@ def outcome_of(
     return _placed(replace(found, comparison=comparison, quality=quality), end)
 
 
-def of_views_of_tracks(found: RefinementResult, end: CarState, cars: CarBatch) -> RefinementResult:
+def of_views_of_tracks(found: RefinementResult, end: State, cars: CarBatch) -> RefinementResult:
     """The result of views of a track with what is known of the images' boxes, which they keep."""
     alone = compared(_at_end(found, end), replace(cars, detector_noise=None), bundled_trust_model().image_noise)
     # What the detector is off by is learnt from cars that are by themselves.
@@ -175,13 +181,13 @@ def of_views_of_tracks(found: RefinementResult, end: CarState, cars: CarBatch) -
     return _placed(replace(found, comparison=replace(alone, difference=nothing, distance_in_sigmas=distance)), end)
 
 
-def _placed(found: RefinementResult, end: CarState) -> RefinementResult:
+def _placed(found: RefinementResult, end: State) -> RefinementResult:
     """The result with the covariance of place and heading that follows from its comparison."""
     location = se3.inverse(end.T_obj_cam)[:, :3, 3]
     return replace(found, covariance_xyz_yaw=covariance_xyz_yaw(found.comparison.covariance, location))
 
 
-def _at_end(found: RefinementResult, end: CarState) -> RefinementResult:
+def _at_end(found: RefinementResult, end: State) -> RefinementResult:
     """The result with every car where its iterations ended, refined or not."""
     status = torch.full_like(found.status_code, Status.converged.code)
     return replace(found, T_cam_obj=se3.inverse(end.T_obj_cam), code=end.code, status_code=status)
@@ -192,20 +198,20 @@ def _depth_factor() -> float:
     return bundled_trust_model().image_noise.factors[0]
 
 
-def _of_field(end: CarState, cars: CarBatch) -> Tensor:
+def _of_field(end: State, cars: CarBatch) -> Tensor:
     """What the covariance (B, 6 + K, 6 + K) owes to the field, whose error moves a car along its viewing ray."""
     origin = se3.inverse(end.T_obj_cam)[:, :3, 3]
     disparity = cars.focal_baseline / origin[:, 2]
     shift_cam = origin * (cars.field_sigma_px / disparity)[:, None]
     # The origin moves by -R_cam_obj v.
     v = -(end.T_obj_cam[:, :3, :3] @ shift_cam[..., None])[..., 0].to(torch.float64)
-    moved_obj = torch.nn.functional.pad(v, (0, 3 + end.code.shape[1]))
+    moved_obj = end.unknowns.only(POSE, CODE).placed(torch.nn.functional.pad(v, (0, 3)), (POSE,))
     return moved_obj[:, :, None] * moved_obj[:, None]
 
 
 def _of_calibrated_rig(problem: CarProblem, figures: Figures) -> Figures:
     """The rig's part of the information in units that the calibration of depth brings to the sigma that was given."""
-    if not problem.num_offsets:
+    if not any("rig" in term.names for term in problem.terms):
         return figures
     factor = torch.ones_like(figures.term_costs)
     factor[:, problem.term_names.index("rig")] = _depth_factor() ** 2 / RIG_WEIGHT
@@ -213,8 +219,8 @@ def _of_calibrated_rig(problem: CarProblem, figures: Figures) -> Figures:
 
 
 def judged(
-    minimum: Minimum[CarState], initial: CarState, found: RefinementResult, limits: AcceptanceConfig
-) -> tuple[Minimum[CarState], RefinementResult]:
+    minimum: Minimum[AnyState], initial: AnyState, found: RefinementResult, limits: AcceptanceConfig
+) -> tuple[Minimum[AnyState], RefinementResult]:
     """Both with the statuses that the figures give, the minimum with the input of cars that they speak against.
 
     A probability that is not known is no reason to return the input, evidence that is missing is one.
@@ -240,7 +246,7 @@ def judged(
     return replace(minimum, state=state, status=status), replace(found, status_code=status, quality=quality)
 
 
-def promised_decrease(minimum: Minimum[CarState]) -> Tensor:
+def promised_decrease(minimum: Minimum[AnyState]) -> Tensor:
     """What a Gauss-Newton step from where the iterations ended promises (B,), as a share of the cost there."""
     after = minimum.after
     gradient, hessian = after.gradient.sum(dim=1), after.hessian.sum(dim=1)

@@ -6,7 +6,6 @@ are handed on to whoever needs them next.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -17,12 +16,11 @@ from torch import Tensor
 from directshape_torch.compile import will_compile
 from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.numerics.gradient_mode import map_tensors
-from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.rows import CarSums, Rays
 from directshape_torch.shape.field import Field, field_of
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.sharing import INDEPENDENT, Sharing
-from directshape_torch.terms.cars import CarState, retract
+from directshape_torch.state.unknowns import LARGEST_ROTATION_RAD, AnyState, State, Unknowns
 from directshape_torch.terms.depth import marched_views
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.priors import PriorTerm, joined
@@ -43,10 +41,6 @@ from directshape_torch.terms.term import (
     with_varying_blocks,
 )
 
-# Trust region: the largest step of each unknown; a larger one is scaled as a whole. A rig that is off by a pixel more
-# between two iterations is another rig.
-_MAX_STEP_M, _MAX_STEP_RAD, _MAX_STEP_CODE, _MAX_STEP_OFFSET_PX = 0.5, 0.15, 1.0, 1.0
-
 
 @dataclass(frozen=True)
 class CarProblem:
@@ -60,10 +54,7 @@ class CarProblem:
     # (B, T) of the columns of the terms of each car, beside their own weights; None for 1
     factors: Tensor | None = None
     num_extra: int = 0  # how many of the terms, the last ones, are a user's own
-    num_offsets: int = 0  # S, 1 where the disparity of a car is off by an unknown offset
-    num_path: int = 0  # N, 9 where views of a track have a path in common
-    num_next: int = 0  # M, 1 where views of a track look at the next
-    sharing: Sharing = INDEPENDENT  # whose shapes are one (`tracks.py`)
+    sharing: Sharing = INDEPENDENT  # whose shapes are one
 
     @property
     def term_names(self) -> tuple[str, ...]:
@@ -79,7 +70,7 @@ class CarProblem:
         return method_stages(self.config)
 
     def parts(
-        self, terms: tuple[Term, ...], field: Field, state: CarState, wheres: tuple[Where, ...], fisher: bool = True
+        self, terms: tuple[Term, ...], field: Field, state: State, wheres: tuple[Where, ...], fisher: bool = True
     ) -> tuple[Part, ...]:
         """What the terms, or the same ones of fewer cars, say of a state; with the Fisher information if that is asked.
 
@@ -92,7 +83,7 @@ class CarProblem:
         # Compiled code has one form for both.
         return parts_of(terms[:own], field, state, wheres[:own], fisher or will_compile()) + of_extra
 
-    def look(self, state: CarState) -> Sight:
+    def look(self, state: State) -> Sight:
         """What every ray sees at a state, marched: constants; state and field keep their graphs."""
         with torch.no_grad():
             field = field_of(self.prior.bind(state.code))
@@ -105,7 +96,8 @@ class CarProblem:
         stages = self.stages()
         earlier = stages[: stages.index(stage)] if stage in stages else []
         after_wider = any(other.contour_width_px > stage.contour_width_px for other in earlier)
-        return CarStage(self, stage, tuple(term.begin(stage, sight) for term in self.terms), after_wider)
+        terms = tuple(term.begin(stage, sight) for term in self.terms)
+        return CarStage(self, stage, terms, after_wider, sight.state.unknowns)
 
     def of_problems(self, keep: Tensor) -> CarProblem:
         """The problem of the cars where `keep` (B,) holds."""
@@ -125,6 +117,7 @@ class CarStage:
     config: StageConfig  # of the stage
     terms: tuple[Term, ...]  # with pixel sets, counts and widths fixed
     after_wider: bool  # an earlier stage had a wider contour
+    unknowns: Unknowns  # of each car
 
     @property
     def photometric(self) -> Photometric | None:
@@ -203,7 +196,7 @@ class CarStage:
         others = [term for term in own if not (isinstance(term, PriorTerm) and term.is_prior)]
         return (*others, joined(priors), *self.terms[len(own) :])
 
-    def linearise_differentiably(self, state: CarState) -> Evaluation:
+    def linearise_differentiably(self, state: State) -> Evaluation:
         """The hand-derived linearisation with an autograd graph to state, images, masks, prior and weights."""
         with torch.no_grad():
             sight = self.problem.look(state)
@@ -212,43 +205,27 @@ class CarStage:
         parts = self.problem.parts(self.terms, field, state, wheres)
         return self.without_held(summed(layout.sums(), layout.weight, parts))
 
-    def moving_unknowns(self, like: Tensor) -> Tensor:
-        """Unknowns (D,) that the stage moves, offsets and paths always, on the device of `like`."""
-        problem, unknowns = self.problem, self.config.unknowns
-        first_other = 6 + problem.prior.num_codes
-        first_next = first_other + problem.num_offsets + problem.num_path
-        number = torch.arange(first_next + 6 * problem.num_next, device=like.device)
-        is_pose, is_other = (number < 6) | (number >= first_next), (number >= first_other) & (number < first_next)
-        return is_other | (is_pose & (unknowns != "shape")) | (~is_pose & (unknowns != "pose"))
-
     def without_held(self, at: Evaluation) -> Evaluation:
         """What the solver sees of it: an unknown that the stage holds has no slope and a curvature of its own."""
         if self.config.unknowns == "both":
             return at
-        moving = self.moving_unknowns(at.gradient)
+        moving = self.unknowns.moving(self.config.unknowns, at.gradient.device)
         identity = torch.eye(len(moving), dtype=at.hessian.dtype, device=at.hessian.device)
         hessian = torch.where(moving[:, None] & moving, at.hessian, identity)
         return at._replace(gradient=torch.where(moving, at.gradient, torch.zeros_like(at.gradient)), hessian=hessian)
 
-    def free_unknowns(self, state: CarState) -> Tensor:
-        """Unknowns (B, D) that no bound holds: a code component at its bound is a constant."""
-        free_pose = torch.ones_like(state.T_obj_cam[:, 0, :1], dtype=torch.bool).expand(-1, 6)
-        free_code = state.code.abs() < self.problem.config.solver.max_code
-        free_others = free_pose[:, :1].expand(-1, state.num_unknowns - 6 - state.code.shape[1])
-        free = torch.cat([free_pose, free_code, free_others], dim=1)
-        return free & self.moving_unknowns(free)
+    def free_unknowns(self, state: State) -> Tensor:
+        """Unknowns (B, D) that neither a bound nor the stage holds."""
+        free = self.unknowns.free(state, self.problem.config.solver.max_code)
+        return free & self.unknowns.moving(self.config.unknowns, free.device)
 
-    def retract(self, state: CarState, step: Tensor) -> CarState:
+    def retract(self, state: AnyState, step: Tensor) -> AnyState:
         """The state moved by tangent vectors (B, D)."""
-        return retract(state, step, self.problem.config.solver.max_code)
+        return self.unknowns.retract(state, step, self.problem.config.solver.max_code)
 
     def step_limits(self) -> Tensor:
         """Largest trusted step of each unknown, (D,) float64; not to be written to."""
-        prior, num_offsets = self.problem.prior, self.problem.num_offsets
-        limits = [_MAX_STEP_M] * 3 + [_MAX_STEP_RAD] * 3 + [_MAX_STEP_CODE] * prior.num_codes
-        # A path follows its views, and the next view is one of them.
-        limits += [_MAX_STEP_OFFSET_PX] * num_offsets + [math.inf] * (self.problem.num_path + 6 * self.problem.num_next)
-        return constant_like(tuple(limits), torch.empty(0, dtype=torch.float64, device=prior.origin.device))
+        return self.unknowns.largest_steps(self.problem.prior.origin.device)
 
 
 @dataclass(frozen=True)
@@ -307,7 +284,7 @@ class CarIterations:
         layout, terms = _Layout.of(terms, factors), tuple(with_varying_blocks(term) for term in terms)
         return cls(stage, terms, layout, layout.sums(), rest, factors, masks, sharing)
 
-    def evaluate(self, state: CarState, near: Evaluation) -> Evaluation:
+    def evaluate(self, state: State, near: Evaluation) -> Evaluation:
         """The energy at a state, looking near where it was evaluated last."""
         problem = self.stage.problem
         if self.rest is None:
@@ -315,7 +292,7 @@ class CarIterations:
             return self.evaluated(sight.field, state, tuple(term.where(sight) for term in self.terms))
         return self.evaluated(field_of(problem.prior.bind(state.code)), state, near.wheres)
 
-    def evaluated(self, field: Field, state: CarState, wheres: tuple[Where, ...]) -> Evaluation:
+    def evaluated(self, field: Field, state: State, wheres: tuple[Where, ...]) -> Evaluation:
         """The energy at a state, looking near the points given."""
         problem, terms = self.stage.problem, self.terms
         parts = problem.parts(terms, field, state, wheres, fisher=False)
@@ -340,10 +317,10 @@ class CarIterations:
 
         return Evaluation(cost, gradient, hessian, tuple(map(chosen, self.terms, new.wheres, old.wheres)))
 
-    def retract(self, state: CarState, step: Tensor) -> CarState:
+    def retract(self, state: AnyState, step: Tensor) -> AnyState:
         """The state moved by tangent vectors (B, D) within the trust region."""
-        # No component of the rotation is larger than its limit.
-        return retract(state, step, self.stage.problem.config.solver.max_code, math.sqrt(3) * _MAX_STEP_RAD)
+        max_code = self.stage.problem.config.solver.max_code
+        return self.stage.unknowns.retract(state, step, max_code, LARGEST_ROTATION_RAD)
 
     def of_problems(self, keep: Tensor, numbers: Sequence[int], at: Evaluation) -> tuple[CarIterations, Evaluation]:
         """Those of the cars where `keep` (B,) holds, `numbers` of them, with their evaluation."""

@@ -11,7 +11,7 @@ from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.rows import Rays
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.terms.cars import CarState
+from directshape_torch.state.cars import CarState
 from directshape_torch.terms.depth import closest_of_march, first_hits, march
 
 

@@ -20,10 +20,9 @@ from directshape_torch.rows import Rows
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.terms.cars import CarBatch, CarState
-from directshape_torch.terms.check_term import check_term, named_errors
-from directshape_torch.terms.motion import MOTION_NAMES
-from directshape_torch.terms.next_view import NEXT_VIEW_NAME
+from directshape_torch.state.cars import CarBatch, CarState
+from directshape_torch.terms.check_term import check_members, check_term, named_errors
+from directshape_torch.terms.derived import with_jacobian
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.photometric_rows import LeftPixels
 from directshape_torch.terms.point_cloud import PointCloud
@@ -75,11 +74,12 @@ def problem_of_scene(
         left = LeftPixels.of(pixels[0], sides[0], pyramid, observation.hidden_right, detections.mask_left)
         terms.append(Photometric(config.photometric, cars, left))
     terms += [] if config.method == "box_alignment" else prior_terms(config.priors, prior, cars)
-    own, extra = len(terms), [_made(make, frames, detections, cars, prior) for make in extra_terms]
+    own = len(terms)
+    extra = [_made(make, frames, detections, cars, prior) for make in extra_terms]
     terms += extra
     if not terms:
         raise ConfigError(f"method {config.method}: expected a term of weight above 0, got none: {_WEIGHTS}")
-    problem = CarProblem(prior, tuple(terms), masks, masks.of_sides(), config, None, len(extra), cars.num_offsets)
+    problem = CarProblem(prior, tuple(terms), masks, masks.of_sides(), config, None, len(extra))
     _check_extra(problem, own, cars)
     factors = _factors(term_weights, problem.term_names, prior.initial_code(len(detections)).to(frames.images_left))
     return problem if factors is None else replace(problem, factors=factors[cars.detection_row])
@@ -90,7 +90,9 @@ def _made(make: TermFactory, frames: FrameBatch, detections: Detections, cars: C
     called = f"extra term of {getattr(make, '__qualname__', type(make).__name__)}"
     cure = "the cars are the rows cars.detection_row of the detections: take these rows of other tensors too"
     with named_errors(called, len(cars), cure):
-        return make(frames, detections, cars, prior)
+        term = make(frames, detections, cars, prior)
+    check_members(term)
+    return with_jacobian(term, prior)
 
 
 def _check_extra(problem: CarProblem, own: int, cars: CarBatch) -> None:
@@ -99,7 +101,7 @@ def _check_extra(problem: CarProblem, own: int, cars: CarBatch) -> None:
         return
     code = problem.prior.initial_code(len(cars)).to(cars.detector_T_cam_obj)
     sight = problem.look(CarState.of(se3.inverse(cars.detector_T_cam_obj), code, cars.num_offsets))
-    names = [*MOTION_NAMES, NEXT_VIEW_NAME, *(name for term in problem.terms[:own] for name in term.names)]
+    names = [name for term in problem.terms[:own] for name in term.names]
     for term in problem.terms[own:]:
         check_term(term, problem.stages()[0], sight, names, lambda code: field_of(problem.prior.bind(code)))
         names += term.names

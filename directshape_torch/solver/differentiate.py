@@ -19,6 +19,7 @@ from directshape_torch.solver.problem import (
     EnergyAt,
     Problem,
     StateT,
+    remade,
     take_rows,
     where_rows,
 )
@@ -212,4 +213,4 @@ def _rows_of(iteration: Iteration[StateT], rows: Tensor) -> Iteration[StateT]:
 
 def _with_values(values: StateT, graph: StateT) -> StateT:
     """The values of one state and the derivatives of the other."""
-    return type(values)(*(v.detach() + (x - x.detach()) for v, x in zip(values, graph, strict=True)))
+    return remade(values, (v.detach() + (x - x.detach()) for v, x in zip(values, graph, strict=True)))

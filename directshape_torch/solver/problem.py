@@ -6,8 +6,8 @@ one before. All of these are values: whoever needs one later keeps it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Protocol, TypeVar
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, Protocol, SupportsIndex, TypeVar, overload
 
 import torch
 from torch import Tensor
@@ -15,7 +15,19 @@ from torch import Tensor
 from directshape_torch.config import StageConfig
 from directshape_torch.solver.sharing import Sharing
 
-StateT = TypeVar("StateT", bound=tuple[Tensor, ...])
+
+class TensorTuple(Protocol):
+    """A named tuple of tensors (B, ...), one row for each problem."""
+
+    def __iter__(self) -> Iterator[Tensor]: ...
+
+    @overload
+    def __getitem__(self, index: SupportsIndex, /) -> Tensor: ...
+    @overload
+    def __getitem__(self, index: slice[Any, Any, Any], /) -> tuple[Tensor, ...]: ...
+
+
+StateT = TypeVar("StateT", bound=TensorTuple)
 
 
 class EnergyAt(Protocol):
@@ -113,14 +125,19 @@ class Problem(Protocol[StateT]):
         ...
 
 
+def remade(state: StateT, tensors: Iterable[Tensor]) -> StateT:
+    """A state of the same kind from other tensors."""
+    return type(state)(*tensors)
+
+
 def take_rows(state: StateT, index: Tensor) -> StateT:
     """Rows of every tensor of a state."""
-    return type(state)(*(x[index] for x in state))
+    return remade(state, (x[index] for x in state))
 
 
 def put_rows(state: StateT, index: Tensor, rows: StateT) -> StateT:
     """A copy of the state with some rows replaced."""
-    return type(state)(*(x.index_copy(0, index, y) for x, y in zip(state, rows, strict=True)))
+    return remade(state, (x.index_copy(0, index, y) for x, y in zip(state, rows, strict=True)))
 
 
 def where_rows(condition: Tensor, a: StateT, b: StateT) -> StateT:
@@ -130,4 +147,4 @@ def where_rows(condition: Tensor, a: StateT, b: StateT) -> StateT:
         # What there is nothing of is alike.
         return torch.where(condition.view(-1, *[1] * (x.ndim - 1)), x, y) if x.shape[1:].numel() else x
 
-    return type(a)(*map(chosen, a, b))
+    return remade(a, map(chosen, a, b))

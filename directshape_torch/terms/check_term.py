@@ -15,14 +15,25 @@ from directshape_torch.numerics.checks import check_shape
 from directshape_torch.numerics.gradient_mode import map_tensors
 from directshape_torch.rows import Blocks
 from directshape_torch.shape.field import Field
-from directshape_torch.terms.cars import CarState
+from directshape_torch.solver.problem import take_rows
+from directshape_torch.state.unknowns import State
 from directshape_torch.terms.term import Linear, Sight, Term, Where, linear_of, part_of
 
-_OWN = ("names", "blocks", "block_weight", "information", "row_weight", "linear", "residual", "norm", "of_cars")
-_DEFAULTS = ("is_prior", "column", "begin", "moving", "where")
+_OWN = ("names", "blocks", "block_weight", "information", "row_weight", "residual", "norm", "of_cars")
+_DEFAULTS = ("sees", "is_prior", "column", "begin", "moving", "where", "linear")
 # Of the largest entry of the matrices and gradients: above what rounding does, below what a centimetre does.
 _ROUNDING = 1e-4
 _LEAVING = "hand tensors of the cars to PriorTerm(values=...), or cut them in of_cars(keep, numbers)"
+
+
+def check_members(term: Term) -> None:
+    """Raise `InputError` unless a term has what `Term` says, and names for its columns."""
+    missing = [name for name in (*_OWN, *_DEFAULTS) if not _has(term, name)]
+    if missing:
+        raise InputError(f"extra term {type(term).__name__}", "the members of `Term`", f"none called {missing[0]}")
+    names = term.names
+    if not (isinstance(names, tuple) and names and all(isinstance(name, str) for name in names)):
+        raise InputError(f"extra term {type(term).__name__}: names", "a tuple of at least one str", repr(names))
 
 
 @torch.no_grad()
@@ -34,19 +45,13 @@ def check_term(
     The term is also evaluated as it is when cars have left: the cars that stay must say what they said before.
 
     Args:
-        term: of B cars, no stage begun.
+        term: of B cars, no stage begun, whose members are there (`check_members`).
         stage: the first one.
         sight: what rays see at any state of these cars.
         taken: names of other terms.
         field_at: the shapes of codes (B, K).
     """
-    missing = [name for name in (*_OWN, *_DEFAULTS) if not _has(term, name)]
-    if missing:
-        raise InputError(f"extra term {type(term).__name__}", "the members of `Term`", f"none called {missing[0]}")
-    names = term.names
-    if not (isinstance(names, tuple) and names and all(isinstance(name, str) for name in names)):
-        raise InputError(f"extra term {type(term).__name__}: names", "a tuple of at least one str", repr(names))
-    called = f"extra term {names[0]!r}"
+    names, called = term.names, f"extra term {term.names[0]!r}"
     if len(set(names)) < len(names) or not set(names).isdisjoint(taken):
         raise InputError(f"{called}: names", f"names that no other column has ({', '.join(taken)})", repr(names))
     num_cars = len(sight.state.code)
@@ -61,13 +66,13 @@ def check_term(
     # Every other car, one car, none: in the first two all numbers change.
     for numbers in dict.fromkeys((tuple(range(1, num_cars, 2)), tuple(range(num_cars))[-1:], ())):
         if len(numbers) < num_cars:
-            few = CarState(*(x[list(numbers)] for x in sight.state))
+            few = take_rows(sight.state, torch.tensor(numbers, dtype=torch.int64, device=sight.state.code.device))
             left = f"{called} after of_cars(...)"
             now = _check_leaving(left, moving, where, few, field_at(few.code), numbers, num_cars)
             check_same(left, now, before, numbers)
 
 
-def car_products(term: Term, field: Field, state: CarState, where: Where) -> Tensor:
+def car_products(term: Term, field: Field, state: State, where: Where) -> Tensor:
     """What a term adds to the systems of its cars (B, D + 1, D): the Gauss-Newton matrix, the gradient below it."""
     products = part_of(term, linear_of(term, field, state, where), fisher=False).products
     sums = products.new_zeros(len(state.code), *products.shape[1:])
@@ -87,7 +92,7 @@ def check_same(called: str, now: Tensor, before: Tensor, numbers: Sequence[int])
 
 
 def _check_leaving(
-    called: str, term: Term, where: Where, few: CarState, field: Field, numbers: Sequence[int], num_cars: int
+    called: str, term: Term, where: Where, few: State, field: Field, numbers: Sequence[int], num_cars: int
 ) -> Tensor:
     """What a few cars, `numbers` of all, add to their systems as an iteration asks for it when the others have left."""
     keep = torch.zeros(num_cars, dtype=torch.bool, device=few.code.device)
@@ -155,7 +160,7 @@ def _check_numbers(called: str, numbers: Tensor, count: int, of_what: str) -> No
         raise InputError(called, f"numbers of the {count} {of_what}", got, "number the cars of this batch from 0")
 
 
-def _check_linear(called: str, term: Term, where: Where, field: Field, state: CarState) -> None:
+def _check_linear(called: str, term: Term, where: Where, field: Field, state: State) -> None:
     """Factors of the Jacobian that fit the rows, and residuals and norms that fit them."""
     with named_errors(called, len(state.code)):
         at = term.linear(field, state, where)
@@ -164,9 +169,9 @@ def _check_linear(called: str, term: Term, where: Where, field: Field, state: Ca
     of_rows = tuple(term.row_weight.shape)
     check_shape(f"{called}.residual", at.residual, of_rows, f"one for each block, row and residual; {_LEAVING}")
     check_shape(f"{called}.J_residual_inner", at.J_residual_inner, of_rows, "by the row's inner scalar")
-    J = linear_of(term, field, state, where).J_inner_state
-    by_state = (*of_rows[:2], state.num_unknowns)
-    check_shape(f"{called}.J_inner_state", J, by_state, "by (v, omega, dcode), without the residual's axis")
+    by_seen = (*of_rows[:2], state.unknowns.only(*term.sees).size)
+    seen = ", ".join(term.sees)
+    check_shape(f"{called}.J_inner_state", at.J_inner_state, by_seen, f"by {seen}, without the residual's axis")
     with named_errors(called.replace("linear", "residual"), len(state.code)):
         again = term.residual(field, state, at.where)
     check_shape(f"{called.replace('linear', 'residual')}", again, of_rows, "those of linear(...)")

@@ -15,8 +15,8 @@ from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.rows import PointSamples
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.state.cars import CarBatch
 from directshape_torch.terms.car_points import every_nth, stands_at
-from directshape_torch.terms.cars import CarBatch
 from directshape_torch.terms.point_cloud import PointCloud
 
 # A detector's error in place, beyond which a point belongs to something else.

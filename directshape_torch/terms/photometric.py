@@ -24,8 +24,9 @@ from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.numerics.tensors import length
 from directshape_torch.rows import BLOCK, Blocks, CarSums, ObjectRays, Rays, Rows
 from directshape_torch.shape.field import Field
+from directshape_torch.state.cars import CarBatch
+from directshape_torch.state.unknowns import CODE, OFFSET, POSE, State
 from directshape_torch.terms import robust
-from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.depth import NEAR_SURFACE_M, Hits, surface_depth, tracked_depth
 from directshape_torch.terms.photometric_rows import (
     LeftPixels,
@@ -81,6 +82,7 @@ class Photometric(Term):
     fixed: PixelSet | None = None  # the pixel set of the stage
 
     names = ("photometric",)
+    sees = (POSE, CODE, OFFSET)
 
     @property
     def pixel_set(self) -> PixelSet:
@@ -149,7 +151,7 @@ class Photometric(Term):
         depth, found = (x.flatten()[place] for x in (sight.hits.depth, sight.hits.found))
         return Surface(points, normal, self.warped_depth(depth, sight.state, self.blocks.owner)[0], found, found)
 
-    def warped_depth(self, depth: Tensor, state: CarState, owner: Tensor) -> tuple[Tensor, Tensor | None]:
+    def warped_depth(self, depth: Tensor, state: State, owner: Tensor) -> tuple[Tensor, Tensor | None]:
         """The depth (M, 64) with which pixels are warped whose surface has a depth (M, 64), and surface over warp.
 
         `1 / warp = 1 / depth + offset / (f B)`; without an unknown offset it is the surface's, and there is no ratio.
@@ -161,7 +163,7 @@ class Photometric(Term):
         ratio = torch.where(ratio > _LEAST_SHARE, ratio, -1.0)
         return depth / ratio, ratio
 
-    def linear(self, field: Field, state: CarState, where: Surface) -> Linear:
+    def linear(self, field: Field, state: State, where: Surface) -> Linear:
         rows, owner = self.pixel_set.rows, self.blocks.owner
         surface = near_surface(rows.rays, field, state, where)
         found, J_depth_state = surface.found, surface.J_depth_state
@@ -175,7 +177,7 @@ class Photometric(Term):
         J = torch.where(usable[..., None], compare.J_residual_depth, 0.0)
         return Linear(residual, J, J_depth_state, surface.seen(where, depth, usable))
 
-    def residual(self, field: Field, state: CarState, where: Surface) -> Tensor:
+    def residual(self, field: Field, state: State, where: Surface) -> Tensor:
         rows = self.pixel_set.rows
         depth = depth_of(rows.rays.in_objects(state.T_obj_cam), rows.rays.owner, field, where)
         depth, _ = self.warped_depth(depth, state, rows.rays.owner)
@@ -220,7 +222,7 @@ class NearSurface(NamedTuple):
         return Surface(points, normal, depth.detach(), self.found, usable)
 
 
-def near_surface(rays_cam: Rays, field: Field, state: CarState, where: Surface) -> NearSurface:
+def near_surface(rays_cam: Rays, field: Field, state: State, where: Surface) -> NearSurface:
     """The surface that rays meet, with the derivative of its depth; differentiable with gradients enabled."""
     rays, owner = rays_cam.in_objects(state.T_obj_cam), rays_cam.owner
     near = tracked_depth(field, rays_cam, rays, Hits(*where[:2], where.usable, where.depth))

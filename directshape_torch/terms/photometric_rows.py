@@ -19,7 +19,7 @@ from directshape_torch.image.interpolate import BilinearPatch, bilinear_patch
 from directshape_torch.masks import MASK_THRESHOLD, MaskCrops
 from directshape_torch.numerics.tensors import all_along, made_once
 from directshape_torch.rows import OcclusionMap, PixelSamples, Rays, Rows
-from directshape_torch.terms.cars import CarBatch
+from directshape_torch.state.cars import CarBatch
 
 # DSO's pattern of 8 neighbourhood pixels (Engel et al., Direct Sparse Odometry, fig. 4), as (du, dv).
 DSO_PATTERN: tuple[tuple[int, int], ...] = ((0, -2), (-1, -1), (1, -1), (-2, 0), (0, 0), (2, 0), (-1, 1), (0, 2))

@@ -18,8 +18,8 @@ from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.rows import Blocks, PointSamples, Rays, Rows
 from directshape_torch.shape.field import Field
+from directshape_torch.state.unknowns import State
 from directshape_torch.terms import robust
-from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.silhouette import sdf_state_jacobian
 from directshape_torch.terms.term import Linear, Term, Where
 
@@ -70,13 +70,13 @@ class PointCloud(Term):
     def row_weight(self) -> Tensor:
         return self.filled[..., None]
 
-    def linear(self, field: Field, state: CarState, where: Where) -> Linear:
+    def linear(self, field: Field, state: State, where: Where) -> Linear:
         points = self._points_obj(state)
         at = field.derivatives(points, self.points_cam.owner, nothing_is_differentiated())
         residual = at.value[..., None]
         return Linear(residual, torch.ones_like(residual), sdf_state_jacobian(points, at.gradient, at), where)
 
-    def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
+    def residual(self, field: Field, state: State, where: Where) -> Tensor:
         return field.value(self._points_obj(state), self.points_cam.owner)[..., None]
 
     def norm(self, residual: Tensor) -> robust.RobustValue:
@@ -89,6 +89,6 @@ class PointCloud(Term):
             self, all_blocks=blocks, points_cam=points, filled=filled, weight=self.weight.index_select(0, kept)
         )
 
-    def _points_obj(self, state: CarState) -> Tensor:
+    def _points_obj(self, state: State) -> Tensor:
         rays = self.points_cam.in_objects(state.T_obj_cam)
         return rays.centre_obj + rays.direction_obj

@@ -1,7 +1,7 @@
 """Priors, `lambda r^2 / 2`: shape code, height above the ground, tilt against it, the detector's box, the rig.
 
-Each residual is a function of the cars and a state that returns it with its Jacobian by `(v, omega, dcode)`; a prior of
-one's own is such a function in a `PriorTerm` (docs/extra_terms.md). Derivations: docs/derivations/priors.md.
+Each residual is a function of the cars and a state that returns it with its Jacobian by the unknowns that it sees; a
+prior of one's own is such a function in a `PriorTerm` (docs/extra_terms.md). Derivations: docs/derivations/priors.md.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.rows import Blocks
 from directshape_torch.shape.field import Field
 from directshape_torch.shape.shape_prior import DimensionsDerivative, ShapePrior
+from directshape_torch.state.cars import CarBatch
+from directshape_torch.state.unknowns import CODE, OFFSET, POSE, State
 from directshape_torch.terms import robust
-from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.term import Linear, Term, Where
 
 RIG_WEIGHT = 0.2
@@ -35,7 +36,7 @@ class PriorResidual(NamedTuple):
     """Residual of a prior for B cars, with its Jacobian."""
 
     residual: Tensor  # (B, R)
-    J_residual_state: Tensor  # (B, R, 6 + K), or (B, R, D)
+    J_residual_state: Tensor  # (B, R, S) by the unknowns that the term sees, block after block
 
 
 @dataclass(frozen=True)
@@ -50,9 +51,11 @@ class PriorTerm(Term):
     name: str  # of the term
     weight: float  # lambda
     cars: CarBatch  # constants of the cars
-    # The residual with its Jacobian, from the constants, a state and, by name, the rows (B, ...) of the values.
-    residual_of: Callable[..., PriorResidual]
+    # The residual with its Jacobian, or the residual (B, R) alone, which is then differentiated automatically; from the
+    # constants, a state and, by name, the rows (B, ...) of the values.
+    residual_of: Callable[..., PriorResidual | Tensor]
     num_rows: int  # R
+    sees: tuple[str, ...] = (POSE, CODE)  # the blocks of unknowns of its Jacobian
     is_prior: bool = True  # False for what belongs to the measurements
     # What else the residual needs to know of each car: tensors (N, ...) of all N detections of the call.
     values: Mapping[str, Tensor] = field(default_factory=dict)
@@ -69,8 +72,8 @@ class PriorTerm(Term):
             check_shape(named, value, (self.cars.num_detections, *rest), cure)
             check_alike(named, value, "the cars", depth if value.is_floating_point() else depth.to(value.dtype))
 
-    def _at(self, state: CarState) -> PriorResidual:
-        """The residual at a state, from the rows of the cars that are left."""
+    def _at(self, state: State) -> PriorResidual | Tensor:
+        """What `residual_of` says of a state, from the rows of the cars that are left."""
         rows = self.cars.detection_row
         return self.residual_of(self.cars, state, **{name: x.index_select(0, rows) for name, x in self.values.items()})
 
@@ -94,13 +97,28 @@ class PriorTerm(Term):
     def row_weight(self) -> Tensor:
         return torch.ones_like(self.cars.input_depth, dtype=torch.float64).expand(self.num_rows, 1, -1).movedim(-1, 0)
 
-    def linear(self, field: Field, state: CarState, where: Where) -> Linear:
+    def _derived(self, state: State) -> PriorResidual:
+        """The residual with its Jacobian by forward-mode differentiation."""
+        unknowns = state.unknowns
+
+        def residual(delta: Tensor) -> tuple[Tensor, Tensor]:
+            at = self._at(unknowns.retract(state, delta.expand(len(state.code), unknowns.size)))
+            assert isinstance(at, Tensor)
+            return at, at
+
+        zero = torch.zeros(unknowns.size, dtype=state.code.dtype, device=state.code.device)
+        J, value = torch.func.jacfwd(residual, has_aux=True)(zero)
+        return PriorResidual(value, J[..., unknowns.columns(self.sees, J.device)])
+
+    def linear(self, field: Field, state: State, where: Where) -> Linear:
         at = self._at(state)
+        at = self._derived(state) if isinstance(at, Tensor) else at
         residual = at.residual.to(torch.float64)[..., None]
         return Linear(residual, torch.ones_like(residual), at.J_residual_state.to(torch.float64), where)
 
-    def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
-        return self._at(state).residual.to(torch.float64)[..., None]
+    def residual(self, field: Field, state: State, where: Where) -> Tensor:
+        at = self._at(state)
+        return (at if isinstance(at, Tensor) else at.residual).to(torch.float64)[..., None]
 
     def norm(self, residual: Tensor) -> robust.RobustValue:
         return robust.quadratic(residual)
@@ -112,34 +130,43 @@ class PriorTerm(Term):
 def prior_terms(config: PriorConfig, prior: ShapePrior, cars: CarBatch) -> list[PriorTerm]:
     """Shape, height, tilt, dimensions, pose where its sigma is known, and the rig where its disparity is not."""
 
-    def of_dimensions(cars: CarBatch, state: CarState) -> PriorResidual:
+    def of_shape(_: CarBatch, state: State) -> PriorResidual:
+        return shape_prior(state.code)
+
+    def of_dimensions(cars: CarBatch, state: State) -> PriorResidual:
         sigma = constant_like(config.dimensions_sigma_m, state.code)
         return dimensions_prior(prior.dimensions_and_derivative(state.code), cars.detector_hwl, sigma)
 
-    def of_pose(cars: CarBatch, state: CarState) -> PriorResidual:
+    def of_pose(cars: CarBatch, state: State) -> PriorResidual:
         sigma = detector_pose_sigma(config, cars)
-        return pose_prior(state.T_obj_cam, cars.detector_T_cam_obj, sigma, state.code.shape[1])
+        return pose_prior(state.T_obj_cam, cars.detector_T_cam_obj, sigma)
 
     tilt, num_tilts = (tilt_prior_normal, 2) if config.tilt_form == "normal" else (tilt_prior_cosine, 1)
     all_terms = [
-        PriorTerm("shape", config.shape_weight, cars, lambda _, state: shape_prior(state.code), prior.num_codes),
-        PriorTerm("height", config.height_weight, cars, height_prior, 1),
-        PriorTerm("tilt", config.tilt_weight, cars, tilt, num_tilts),
-        PriorTerm("dimensions", config.dimensions_weight, cars, of_dimensions, 3),
+        PriorTerm("shape", config.shape_weight, cars, of_shape, prior.num_codes, (CODE,)),
+        PriorTerm("height", config.height_weight, cars, height_prior, 1, (POSE,)),
+        PriorTerm("tilt", config.tilt_weight, cars, tilt, num_tilts, (POSE,)),
+        PriorTerm("dimensions", config.dimensions_weight, cars, of_dimensions, 3, (CODE,)),
     ]
     if cars.detector_pose_sigma is not None or any(config.pose_sigmas):
-        all_terms.append(PriorTerm("pose", config.pose_weight, cars, of_pose, 4))
+        all_terms.append(PriorTerm("pose", config.pose_weight, cars, of_pose, 4, (POSE,)))
     if cars.num_offsets:
         # How well a disparity is measured: what the images say of a car holds no more than that.
-        all_terms.append(PriorTerm("rig", RIG_WEIGHT, cars, rig_prior, 1, is_prior=False))
+        all_terms.append(PriorTerm("rig", RIG_WEIGHT, cars, rig_prior, 1, (OFFSET,), is_prior=False))
     return [term for term in all_terms if term.weight > 0]
 
 
 def joined(terms: Sequence[PriorTerm]) -> PriorTerm:
-    """One term that costs what some terms of the same cars do together: an iteration asks for the sum alone."""
+    """One term that costs what priors of pose and shape do together: an iteration asks for the sum alone."""
 
-    def residual_of(cars: CarBatch, state: CarState) -> PriorResidual:
-        scaled = [[math.sqrt(term.weight) * x for x in term.residual_of(cars, state)] for term in terms]
+    def residual_of(cars: CarBatch, state: State) -> PriorResidual:
+        unknowns = state.unknowns.only(POSE, CODE)
+        scaled = []
+        for term in terms:
+            at = term.residual_of(cars, state)
+            assert isinstance(at, PriorResidual)  # as ours are
+            J = unknowns.placed(at.J_residual_state, term.sees)
+            scaled.append([math.sqrt(term.weight) * x for x in (at.residual, J)])
         return PriorResidual(*(torch.cat(parts, dim=1) for parts in zip(*scaled, strict=True)))
 
     return PriorTerm("priors", 1.0, terms[0].cars, residual_of, sum(term.num_rows for term in terms))
@@ -163,10 +190,10 @@ def shape_prior(code: Tensor) -> PriorResidual:
     """Pulls the whitened code (B, K) to the mean shape (paper, E_shape; sigma is folded into the basis)."""
     num_cars, num_codes = code.shape
     identity = torch.eye(num_codes, dtype=code.dtype, device=code.device)
-    return PriorResidual(code, torch.nn.functional.pad(identity, (6, 0)).expand(num_cars, -1, -1))
+    return PriorResidual(code, identity.expand(num_cars, -1, -1))
 
 
-def height_prior(cars: CarBatch, state: CarState) -> PriorResidual:
+def height_prior(cars: CarBatch, state: State) -> PriorResidual:
     """Height of the object origin against the ground plane, along the camera's y axis (paper, r_trans), metres.
 
     `r = (n . t + d) / n_y` with t the object origin in the camera frame, which moves by `-R_cam_obj v`.
@@ -175,10 +202,10 @@ def height_prior(cars: CarBatch, state: CarState) -> PriorResidual:
     n_obj, n_y = _ground_normal_obj(cars, state), cars.ground_normal_cam[:, 1]
     residual = (cars.ground_offset - (n_obj * state.T_obj_cam[:, :3, 3]).sum(-1)) / n_y
     J_v = -n_obj / n_y[:, None]
-    return PriorResidual(residual[:, None], torch.nn.functional.pad(J_v, (0, 3 + state.code.shape[1]))[:, None])
+    return PriorResidual(residual[:, None], torch.nn.functional.pad(J_v, (0, 3))[:, None])
 
 
-def tilt_prior_normal(cars: CarBatch, state: CarState) -> PriorResidual:
+def tilt_prior_normal(cars: CarBatch, state: State) -> PriorResidual:
     """Horizontal components of the ground normal in the object frame: zero for a car that stands on the ground.
 
     `n_obj = R_obj_cam n`, `r = (n_obj.x, n_obj.z)`; unlike the paper's form its Jacobian does not vanish at zero.
@@ -186,23 +213,23 @@ def tilt_prior_normal(cars: CarBatch, state: CarState) -> PriorResidual:
     x, y, z = _ground_normal_obj(cars, state).unbind(-1)
     zero = torch.zeros_like(x)
     J_x, J_z = torch.stack([zero, z, -y], dim=-1), torch.stack([y, -x, zero], dim=-1)
-    return PriorResidual(torch.stack([x, z], dim=-1), _by_rotation(torch.stack([J_x, J_z], dim=1), state))
+    return PriorResidual(torch.stack([x, z], dim=-1), _by_rotation(torch.stack([J_x, J_z], dim=1)))
 
 
-def tilt_prior_cosine(cars: CarBatch, state: CarState) -> PriorResidual:
+def tilt_prior_cosine(cars: CarBatch, state: State) -> PriorResidual:
     """The paper's `r_rot = 1 - (R_cam_obj [0, -1, 0]) . n = 1 + n_obj.y`; its Jacobian vanishes where r does."""
     x, y, z = _ground_normal_obj(cars, state).unbind(-1)
     J_omega = torch.stack([-z, torch.zeros_like(x), x], dim=-1)[:, None]
-    return PriorResidual((1 + y)[:, None], _by_rotation(J_omega, state))
+    return PriorResidual((1 + y)[:, None], _by_rotation(J_omega))
 
 
-def _ground_normal_obj(cars: CarBatch, state: CarState) -> Tensor:
+def _ground_normal_obj(cars: CarBatch, state: State) -> Tensor:
     return (state.T_obj_cam[:, :3, :3] * cars.ground_normal_cam[:, None]).sum(-1)
 
 
-def _by_rotation(J_omega: Tensor, state: CarState) -> Tensor:
-    """Jacobian by the whole state of a residual that only rotation changes, from its part (B, R, 3)."""
-    return torch.nn.functional.pad(J_omega, (3, state.code.shape[1]))
+def _by_rotation(J_omega: Tensor) -> Tensor:
+    """Jacobian by the pose of a residual that only rotation changes, from its part (B, R, 3)."""
+    return torch.nn.functional.pad(J_omega, (3, 0))
 
 
 def dimensions_prior(
@@ -214,15 +241,13 @@ def dimensions_prior(
 
     A car seen from behind does not show its length: the detector's dimensions are information (not in the paper).
     """
-    J_residual_code = shape.J_hwl_code / sigma_hwl[:, None]
-    return PriorResidual((shape.hwl - detector_hwl) / sigma_hwl, torch.nn.functional.pad(J_residual_code, (6, 0)))
+    return PriorResidual((shape.hwl - detector_hwl) / sigma_hwl, shape.J_hwl_code / sigma_hwl[:, None])
 
 
 def pose_prior(
     T_obj_cam: Tensor,  # (B, 4, 4)
     detector_T_cam_obj: Tensor,  # (B, 4, 4) input pose
     sigma: Tensor,  # (B, 4) along the viewing ray, across it, vertically (metres), heading (radians); infinite: no part
-    num_codes: int,
 ) -> PriorResidual:
     """Object origin and heading against the detector's, in the detector's standard deviations (not in the paper).
 
@@ -235,7 +260,7 @@ def pose_prior(
     x_axis, x_detector = R_cam_obj[:, 0::2, 0], detector_T_cam_obj[:, 0::2, 0]
     sine = x_axis[:, 0] * x_detector[:, 1] - x_axis[:, 1] * x_detector[:, 0]
     turned = torch.atan2(sine, (x_axis * x_detector).sum(-1))
-    J = T_obj_cam.new_zeros(len(T_obj_cam), 4, 6 + num_codes)
+    J = T_obj_cam.new_zeros(len(T_obj_cam), 4, 6)
     J[:, :3, :3] = -axes @ R_cam_obj
     J[:, 3, 3:6] = J_heading_omega(R_cam_obj)
     return PriorResidual(torch.cat([moved, turned[:, None]], dim=-1) / sigma, J / sigma[..., None])
@@ -251,10 +276,8 @@ def J_heading_omega(R_obj: Tensor) -> Tensor:
     return torch.stack([torch.zeros_like(by_y), by_y, by_z], dim=-1) / (x_axis * x_axis).sum(-1, keepdim=True)
 
 
-def rig_prior(cars: CarBatch, state: CarState) -> PriorResidual:
+def rig_prior(cars: CarBatch, state: State) -> PriorResidual:
     """Offset of the disparity in its standard deviations; pixels for a car that has none, whose offset stays 0."""
     assert cars.offset_sigma_px is not None
     sigma = torch.where(cars.offset_sigma_px > 0, cars.offset_sigma_px, 1.0)[:, None]
-    return PriorResidual(
-        state.offset_px / sigma, torch.nn.functional.pad(1 / sigma, (6 + state.code.shape[1], 0))[:, None]
-    )
+    return PriorResidual(state.offset_px / sigma, (1 / sigma)[:, None])

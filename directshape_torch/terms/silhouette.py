@@ -24,8 +24,9 @@ from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.rows import Blocks, CarSums, PixelSamples, Rays, Rows
 from directshape_torch.shape.field import Field
 from directshape_torch.shape.sdf_grid import Lookup
+from directshape_torch.state.cars import CarBatch
+from directshape_torch.state.unknowns import State
 from directshape_torch.terms import robust
-from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.depth import (
     Closest,
     along_face,
@@ -193,7 +194,7 @@ class Silhouettes(Term):
     def where(self, sight: Sight) -> Where:
         return sight.closest
 
-    def linear(self, field: Field, state: CarState, where: Where) -> Linear:
+    def linear(self, field: Field, state: State, where: Where) -> Linear:
         rays = self.rows.rays.in_objects(state.T_obj_cam)
         now = tracked_closest(field, self.rows.rays, rays, self.bounds_obj, where)
         constant = nothing_is_differentiated()
@@ -204,7 +205,7 @@ class Silhouettes(Term):
         residual, J_residual_sdf = self._of_distance(at.value, now.crosses)
         return Linear(residual[..., None], J_residual_sdf[..., None], sdf_state_jacobian(points, gradient, at), now)
 
-    def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
+    def residual(self, field: Field, state: State, where: Where) -> Tensor:
         rays = self.rows.rays.in_objects(state.T_obj_cam)
         points = rays.at(where.depth)
         across = (where.face_obj * rays.direction_obj).sum(0).detach()
@@ -290,7 +291,7 @@ class SilhouetteProducts(Silhouettes):
 
     moving, where = Term.moving, Term.where
 
-    def linear(self, field: Field, state: CarState, where: Where) -> Linear:
+    def linear(self, field: Field, state: State, where: Where) -> Linear:
         owner = self.rows.rays.owner
         rays = self.rows.rays.in_objects(state.T_obj_cam)
         num_samples, constant = self.config.samples_per_ray, nothing_is_differentiated()
@@ -312,7 +313,7 @@ class SilhouetteProducts(Silhouettes):
         residual = torch.where(crosses, residual, self.rows.residual_of_a_miss())
         return Linear(residual[..., None], torch.ones_like(residual)[..., None], J, Samples(depths.detach(), crosses))
 
-    def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
+    def residual(self, field: Field, state: State, where: Where) -> Tensor:
         rays = self.rows.rays.in_objects(state.T_obj_cam)
         sdf = field.value(rays.at(where.depths), self.rows.rays.owner)
         residual, _ = product_residual(sdf, self.zeta, self.rows.foreground)

@@ -19,7 +19,7 @@ from directshape_torch.config import StageConfig
 from directshape_torch.rows import Blocks, CarSums
 from directshape_torch.shape.field import Field, field_of
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.terms.cars import CarState, retract
+from directshape_torch.state.unknowns import CODE, POSE, State
 from directshape_torch.terms.depth import Closest, Hits
 from directshape_torch.terms.robust import RobustValue
 
@@ -30,7 +30,7 @@ Where: TypeAlias = Any
 class Sight(NamedTuple):
     """What the rays of all pixels see at a state where nothing was known before: constants."""
 
-    state: CarState
+    state: State
     field: Field
     closest: Closest  # of the rays of both images, left ones first
     hits: Hits  # of the rays of the left image
@@ -41,7 +41,7 @@ class Linear(NamedTuple):
 
     residual: Tensor  # (M, R, N)
     J_residual_inner: Tensor  # (M, R, N)
-    J_inner_state: Tensor  # (M, R, D), or (M, R, 6 + K) of terms that do not look at disparities
+    J_inner_state: Tensor  # (M, R, S) by the unknowns that the term sees, block after block
     where: Where  # the points at which they were taken
 
 
@@ -70,6 +70,11 @@ class Term(Protocol):
     def names(self) -> tuple[str, ...]:
         """Of the C columns of costs that it fills."""
         ...
+
+    @property
+    def sees(self) -> tuple[str, ...]:
+        """The blocks of unknowns by which its Jacobian is given, in their order (`state.unknowns`)."""
+        return POSE, CODE
 
     @property
     def is_prior(self) -> bool:
@@ -118,14 +123,15 @@ class Term(Protocol):
         """Where the rows look at a state at which every ray was marched."""
         return ()
 
-    def linear(self, field: Field, state: CarState, where: Where) -> Linear:
+    def linear(self, field: Field, state: State, where: Where) -> Linear:
         """Residuals with their hand-derived Jacobian, looking near `where`, which is that of a state nearby.
 
+        A user's term may do without it: `terms.derived` then differentiates its `residual`.
         With gradients enabled all of it is differentiable, by the state and by whatever the term is made of.
         """
         ...
 
-    def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
+    def residual(self, field: Field, state: State, where: Where) -> Tensor:
         """Residuals (M, R, N) by themselves, of states next to the one whose `linear` gave `where`; differentiable."""
         ...
 
@@ -148,13 +154,10 @@ class Part(NamedTuple):
     where: Where  # the points at which they were taken
 
 
-def linear_of(term: Term, field: Field, state: CarState, where: Where) -> Linear:
-    """`term.linear` with a column for each unknown of the state; few terms know of the last, beside pose and code."""
+def linear_of(term: Term, field: Field, state: State, where: Where) -> Linear:
+    """`term.linear` with a column for each unknown of the state, zeros by those that the term does not see."""
     at = term.linear(field, state, where)
-    missing = state.num_unknowns - at.J_inner_state.shape[-1]
-    if not 0 < missing <= state.num_unknowns - 6 - state.code.shape[1]:
-        return at
-    return at._replace(J_inner_state=torch.nn.functional.pad(at.J_inner_state, (0, missing)))
+    return at._replace(J_inner_state=state.unknowns.placed(at.J_inner_state, term.sees))
 
 
 def part_of(term: Term, at: Linear, fisher: bool = True) -> Part:
@@ -223,7 +226,7 @@ def with_varying_blocks(term: Term) -> Term:
 
 @compilable(sizes=_SIZES)
 def parts_of(
-    terms: tuple[Term, ...], field: Field, state: CarState, wheres: tuple[Where, ...], fisher: bool = True
+    terms: tuple[Term, ...], field: Field, state: State, wheres: tuple[Where, ...], fisher: bool = True
 ) -> tuple[Part, ...]:
     """All terms at a state, looking near the points given, with their hand-derived Jacobians."""
     ats = [linear_of(term, field, state, where) for term, where in zip(terms, wheres, strict=True)]
@@ -275,7 +278,7 @@ def summed(sums: CarSums, weight: Tensor, parts: Sequence[Part]) -> Evaluation:
 
 
 def by_autograd(
-    terms: Sequence[Term], prior: ShapePrior, state: CarState, wheres: Sequence[Where]
+    terms: Sequence[Term], prior: ShapePrior, state: State, wheres: Sequence[Where]
 ) -> list[tuple[Tensor, Tensor]]:
     """Residuals (M, R, N) of every term and their Jacobian (M, R, N, D) by forward-mode differentiation.
 
@@ -283,12 +286,14 @@ def by_autograd(
     share one evaluation of the values. Where the rows look is a constant, as in the hand-derived form.
     """
 
+    unknowns = state.unknowns
+
     def residuals(delta: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-        moved = retract(state, delta.expand(len(state.code), state.num_unknowns))
+        moved = unknowns.retract(state, delta.expand(len(state.code), unknowns.size))
         field = field_of(prior.bind(moved.code))
         of_terms = [term.residual(field, moved, where) for term, where in zip(terms, wheres, strict=True)]
         return of_terms, of_terms
 
-    zero = torch.zeros(state.num_unknowns, dtype=state.code.dtype, device=state.code.device)
+    zero = torch.zeros(unknowns.size, dtype=state.code.dtype, device=state.code.device)
     jacobians, values = torch.func.jacfwd(residuals, has_aux=True)(zero)
     return list(zip(values, jacobians, strict=True))

@@ -19,8 +19,8 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.solver.gauss_newton import Minimum, minimise
 from directshape_torch.solver.problem import put_rows, where_rows
+from directshape_torch.state.cars import CarState
 from directshape_torch.status import Status
-from directshape_torch.terms.cars import CarState
 from directshape_torch.visualize.residuals import CarResiduals, car_residuals
 
 
@@ -101,7 +101,7 @@ def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections
     everyone, inputs = refiner.problem(frames, detections)
     problem, initial = everyone.of_problems(took_part), CarState(*(x[rows] for x in inputs))
     with full_precision(), compiling(refiner.config.compile, len(detections)):
-        minimum = minimise(problem, initial, refiner.config.solver, record=True)
+        minimum: Minimum[CarState] = minimise(problem, initial, refiner.config.solver, record=True)
         states = [initial, *_ends(minimum)]
         costs = torch.stack([minimum.stage.figures(problem.look(state)).term_costs for state in states])
     none = torch.zeros_like(took_part)

@@ -20,7 +20,7 @@ from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.terms.cars import CarState
+from directshape_torch.state.cars import CarState
 from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.term import Part, Sight
 from directshape_torch.visualize.drawing import Array, View, blue_white_red

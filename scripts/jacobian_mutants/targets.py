@@ -83,14 +83,14 @@ TARGETS: dict[str, Target] = {
         (*_OFFSET[:1], "tests/terms/test_priors.py", *_JACOBIANS),
     ),
     "motion": Target(
-        "directshape_torch/terms/motion.py",
+        "directshape_torch/tracks/path.py",
         ("path_prior", "acceleration_prior", "_on_the_ground", "_basis"),
-        (*_TRACK, "tests/terms/test_motion.py"),
+        (*_TRACK, "tests/tracks/test_path.py"),
     ),
     "next_view": Target(
-        "directshape_torch/terms/next_view.py",
+        "directshape_torch/tracks/next_view.py",
         ("NextView.linear", "NextView.residual", "NextView._looked_up"),
-        (*_TRACK, "tests/terms/test_next_view.py"),
+        (*_TRACK, "tests/tracks/test_next_view.py"),
     ),
     "robust": Target(
         "directshape_torch/terms/robust.py",
@@ -130,8 +130,12 @@ TARGETS: dict[str, Target] = {
     "se3_group": Target(
         "directshape_torch/geometry/se3.py", ("inverse", "transform", "from_kornia", "to_kornia"), _SE3_TESTS
     ),
-    "retract": Target("directshape_torch/terms/cars.py", ("retract",), _JACOBIANS),
-    "offset": Target("directshape_torch/terms/cars.py", ("CarBatch.inverse_depth_of_offset",), _OFFSET),
+    "unknowns": Target(
+        "directshape_torch/state/unknowns.py",
+        ("Block.moved", "Unknowns.span", "Unknowns.placed", "Unknowns.retract"),
+        (*_OFFSET[:1], "tests/state/test_unknowns.py", *_JACOBIANS),
+    ),
+    "offset": Target("directshape_torch/state/cars.py", ("CarBatch.inverse_depth_of_offset",), _OFFSET),
     "projection": Target(
         "directshape_torch/geometry/projection.py",
         ("rays_from_pixels", "project", "warp_to_right", "right_rays"),
@@ -272,7 +276,6 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     ),
     Equivalent("_on_the_ground", "R", "(-R)", f"in J_heading_omega it {_IN_PAIRS}"),
     Equivalent("tilt_prior_normal", "zero", "(-zero)", _OF_ZERO),
-    Equivalent("NextView.linear", "others", "(-others)", _OF_ZERO),
     Equivalent("pose_prior", "R_cam_obj", "(-R_cam_obj)", f"in J_heading_omega it {_IN_PAIRS}"),
     Equivalent("_higher_exp_coefficients", "0.5 * angle", "(-(0.5 * angle))", "only the square of its sine is used"),
     Equivalent(

@@ -28,7 +28,7 @@ from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.from_files import estimate_rigs
 from directshape_torch.rig.rigs import RigEstimates
 from directshape_torch.scene import Detections
-from directshape_torch.terms.cars import CarBatch
+from directshape_torch.state.cars import CarBatch
 
 Array = NDArray[np.float64]
 EVERYTHING = AcceptanceConfig(min_probability_better=0.0, min_probability_not_worse=0.0)

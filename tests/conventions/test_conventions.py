@@ -32,7 +32,7 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.sdf_grid import Lookup
 from directshape_torch.shape.shape_prior import DimensionsDerivative
 from directshape_torch.solver.damped_solve import damped_step
-from directshape_torch.terms.cars import CarState, retract
+from directshape_torch.state.cars import CarState
 from directshape_torch.terms.depth import march
 from directshape_torch.terms.photometric_rows import DSO_PATTERN
 from directshape_torch.terms.priors import dimensions_prior, height_prior, shape_prior
@@ -206,14 +206,14 @@ def test_13_result_files_keep_what_is_not_refined(tmp_path: Path) -> None:
 
 def test_14_tangent_is_v_omega_dcode() -> None:
     state = CarState.of(torch.eye(4).double()[None], torch.zeros(1, 3).double())
-    moved = retract(state, vector(0.1, 0.2, 0.3, 0, 0, 0, 1, 2, 3)[None])
+    moved = state.unknowns.retract(state, vector(0.1, 0.2, 0.3, 0, 0, 0, 1, 2, 3)[None])
     torch.testing.assert_close(moved.T_obj_cam[0, :3, 3], vector(0.1, 0.2, 0.3))
     torch.testing.assert_close(moved.code[0], vector(1, 2, 3))
-    turned = retract(state, vector(0, 0, 0, 0, 0, math.pi / 2, 0, 0, 0)[None])
+    turned = state.unknowns.retract(state, vector(0, 0, 0, 0, 0, math.pi / 2, 0, 0, 0)[None])
     torch.testing.assert_close(turned.T_obj_cam[0, :3, 0], vector(0, 1, 0))
     unsure = CarState.of(*state[:2], num_offsets=1)
-    assert (state.num_unknowns, unsure.num_unknowns) == (9, 10)
-    offset = retract(unsure, vector(0, 0, 0, 0, 0, 0, 1, 2, 3, 0.4)[None])
+    assert (state.unknowns.size, unsure.unknowns.size) == (9, 10)
+    offset = unsure.unknowns.retract(unsure, vector(0, 0, 0, 0, 0, 0, 1, 2, 3, 0.4)[None])
     assert torch.equal(offset.code, moved.code)
     assert offset.offset_px.tolist() == [[0.4]]
 
@@ -222,9 +222,9 @@ def test_15_update_is_on_the_left_and_in_one_place() -> None:
     T_cam_obj = box3d.pose_from_kitti(vector(3, 1.6, 25), torch.tensor(0.7).double())
     state = CarState.of(se3.inverse(T_cam_obj)[None], torch.zeros(1, 2).double())
     delta = vector(0.2, 0.0, -0.1, 0.01, 0.3, 0.02, 0, 0)
-    after = retract(state, delta[None]).T_obj_cam[0]
+    after = state.unknowns.retract(state, delta[None]).T_obj_cam[0]
     torch.testing.assert_close(after, se3.exp(delta[:6]) @ state.T_obj_cam[0])
-    turned = retract(state, vector(0, 0, 0, 0, 0.3, 0, 0, 0)[None]).T_obj_cam[0]
+    turned = state.unknowns.retract(state, vector(0, 0, 0, 0, 0.3, 0, 0, 0)[None]).T_obj_cam[0]
     torch.testing.assert_close(se3.inverse(turned)[:3, 3], T_cam_obj[:3, 3])
     callers = [
         path.name

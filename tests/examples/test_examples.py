@@ -15,8 +15,7 @@ from directshape_torch.cli.demo import demo_dataset
 from directshape_torch.io.config_files import load_config
 from directshape_torch.shape.field import field_of
 from directshape_torch.status import Status
-from directshape_torch.terms.cars import retract
-from directshape_torch.terms.term import by_autograd
+from directshape_torch.terms.term import by_autograd, linear_of
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -78,9 +77,9 @@ def test_the_jacobian_of_the_upright_prior_is_right() -> None:
     of = example("upright_prior")
     exact = load_config(None, ["rig.disparity_sigma_px=0"])
     problem, state = DirectShapeRefiner(None, exact, [of["upright_prior"]]).problem(*_demo(of))
-    state = retract(state, 0.2 * torch.randn(len(state.code), 6 + state.code.shape[1]))
+    state = state.unknowns.retract(state, 0.2 * torch.randn(len(state.code), state.unknowns.size))
     term = problem.terms[problem.term_names.index("upright") - len(problem.term_names)]
-    at = term.linear(field_of(problem.prior.bind(state.code)), state, ())
+    at = linear_of(term, field_of(problem.prior.bind(state.code)), state, ())
     ((residual, jacobian),) = by_autograd([term], problem.prior, state, [()])
     torch.testing.assert_close(at.residual, residual)
     torch.testing.assert_close(at.J_residual_inner[..., None] * at.J_inner_state[:, :, None], jacobian.to(at.residual))

@@ -8,23 +8,28 @@ import torch
 from torch import Tensor
 
 from directshape_torch.geometry import se3
-from directshape_torch.terms.cars import CarState
+from directshape_torch.solver.problem import remade
+from directshape_torch.state.unknowns import AnyState, State
 
 
-def moved(state: CarState, delta: Tensor) -> CarState:
-    """The state at `delta` (B, D) of its own tangent, by the definition of CONVENTIONS.md; differentiable."""
-    last, size = 6, []
-    for part in state[1:4]:
-        size.append(delta[:, last : last + part.shape[1]])
-        last += part.shape[1]
-    others = (x + dx for x, dx in zip(state[1:4], size, strict=True))
-    T_obj_next = se3.exp(delta[:, last:].unflatten(1, (state.T_obj_next.shape[1], 6))) @ state.T_obj_next
-    return CarState(se3.exp(delta[:, :6]) @ state.T_obj_cam, *others, T_obj_next)
+def moved(state: AnyState, delta: Tensor) -> AnyState:
+    """The state at `delta` (B, D) of its own tangent, by the definition of CONVENTIONS.md; differentiable.
+
+    Poses are moved by `exp` from the left, everything else by addition.
+    """
+    first, parts = 0, []
+    for value in state:
+        size = 6 * value[0].numel() // 16 if value.shape[-2:] == (4, 4) else value.shape[1]
+        step = delta[:, first : first + size]
+        moves = value.shape[-2:] == (4, 4)
+        parts.append(se3.exp(step.reshape(*value.shape[:-2], 6)) @ value if moves else value + step)
+        first += size
+    return remade(state, parts)
 
 
-def tangent_of(state: CarState) -> Tensor:
+def tangent_of(state: State) -> Tensor:
     """Zero tangent vectors (B, D)."""
-    return state.code.new_zeros(len(state.code), state.num_unknowns)
+    return state.code.new_zeros(len(state.code), state.unknowns.size)
 
 
 def central_differences(function: Callable[[Tensor], Tensor], at: Tensor, step: float = 1e-6) -> Tensor:

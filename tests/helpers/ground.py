@@ -7,7 +7,7 @@ from dataclasses import fields
 import torch
 from torch import Tensor
 
-from directshape_torch.terms.cars import CarBatch
+from directshape_torch.state.cars import CarBatch
 
 
 def cars_on(normal: Tensor, offset: Tensor, count: int) -> CarBatch:

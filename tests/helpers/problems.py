@@ -13,7 +13,7 @@ from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
-from directshape_torch.terms.cars import CarState
+from directshape_torch.state.cars import CarState
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.term import Figures
 

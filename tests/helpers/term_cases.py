@@ -10,7 +10,7 @@ import torch
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.geometry import se3
 from directshape_torch.refinement.problem import CarStage
-from directshape_torch.terms.cars import CarState
+from directshape_torch.state.cars import CarState
 from helpers.derivatives import moved, tangent_of
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import CONFIGS, DEFAULT, begun_stage, with_code

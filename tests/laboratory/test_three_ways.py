@@ -14,8 +14,8 @@ from directshape_torch.laboratory.experiments import AT_FIXED_DEPTHS, gradient_e
 from directshape_torch.laboratory.regimes import REGIMES
 from directshape_torch.shape.field import field_of
 from directshape_torch.terms import photometric
-from directshape_torch.terms.cars import retract
 from directshape_torch.terms.depth import Closest
+from directshape_torch.terms.term import linear_of
 
 BenchOf = Callable[..., Bench]
 _MORE = {"disparity_offset": ("rig",), "track": TRACK_NAMES}
@@ -98,7 +98,7 @@ def test_sums_are_those_of_single_residuals(bench_of: BenchOf, regime: str) -> N
     figures = stage.figures(bench.sight)
     column = 0
     for number_of_term, term in enumerate(stage.terms):
-        at = term.linear(bench.sight.field, bench.state, term.where(bench.sight))
+        at = linear_of(term, bench.sight.field, bench.state, term.where(bench.sight))
         norm, J = term.norm(at.residual), jacobian(at)
         assert torch.equal(figures.parts[number_of_term].residual, at.residual)
         for number in range(len(term.names)):
@@ -138,7 +138,7 @@ def test_a_tracked_pixel_ends_on_the_surface(bench_of: BenchOf) -> None:
     term, field = bench.stage.photometric, bench.sight.field
     assert term is not None
     step = torch.full((len(bench.state.code), bench.num_unknowns), 0.03, dtype=torch.float64)
-    moved = retract(bench.state, step, max_code=3.0)._replace(code=bench.state.code)
+    moved = bench.state.unknowns.retract(bench.state, step, max_code=3.0)._replace(code=bench.state.code)
     rays = term.pixel_set.rows.rays
     found = photometric.near_surface(rays, field, moved, term.where(bench.sight))
     here, end = (

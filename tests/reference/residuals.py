@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.terms.cars import CarState
+from directshape_torch.state.cars import CarState
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.photometric_rows import DSO_PATTERN
 from reference.rays import RaysObj, first_entry

@@ -21,8 +21,8 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rows import Rays
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.state.cars import CarState, move_by_disparity
 from directshape_torch.status import Status
-from directshape_torch.terms.cars import CarState, move_by_disparity
 from directshape_torch.terms.lidar import LidarPoints
 from directshape_torch.visualize.refinement_trace import trace_refinement
 

@@ -17,8 +17,8 @@ from directshape_torch.refinement.fusion import UNKNOWN_DETECTOR, compared, fuse
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.trust import bundled_trust_model
 from directshape_torch.scene import Detections
+from directshape_torch.state.cars import CarBatch
 from directshape_torch.status import Status
-from directshape_torch.terms.cars import CarBatch
 
 TOGETHER = replace(DEFAULT, priors=replace(DEFAULT.priors, detector_weight=1.0))
 NOTHING_KNOWN = torch.full((7,), 1e6, dtype=torch.float64)

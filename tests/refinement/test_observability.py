@@ -25,7 +25,7 @@ from directshape_torch.refinement.observability import (
     quantities_jacobian,
     view_in_words,
 )
-from directshape_torch.terms.cars import CarState
+from directshape_torch.state.cars import CarState
 
 LENGTH, DEPTH = (CAR_QUANTITIES.index(name) for name in ("length", "depth"))
 

@@ -14,8 +14,8 @@ from directshape_torch.refinement.outcome import as_they_came, outcome_of
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refinement.quality import mask_ious, photometric_agreement
 from directshape_torch.solver.gauss_newton import Minimum
+from directshape_torch.state.cars import CarBatch, CarState
 from directshape_torch.status import Status
-from directshape_torch.terms.cars import CarBatch, CarState
 
 
 def begun(config: RefinerConfig = DEFAULT) -> tuple[CarStage, CarState]:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.refinement.problem import CarStage
-from directshape_torch.terms.cars import CarState
+from directshape_torch.state.cars import CarState
 from directshape_torch.terms.photometric import Brightness, is_grazing
 from directshape_torch.terms.photometric_rows import DSO_PATTERN, GRADIENT_CONSTANT, compared, residuals_at
 from directshape_torch.terms.robust import huber

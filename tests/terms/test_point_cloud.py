@@ -17,7 +17,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.rows import PointSamples
 from directshape_torch.shape.field import field_of
-from directshape_torch.terms.cars import CarState
+from directshape_torch.state.cars import CarState
 from directshape_torch.terms.point_cloud import PointCloud
 from directshape_torch.terms.robust import RobustValue
 from directshape_torch.terms.term import Linear, part_of

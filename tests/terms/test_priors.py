@@ -12,7 +12,7 @@ from torch import Tensor
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti, viewing_axes
 from directshape_torch.shape.shape_prior import DimensionsDerivative
-from directshape_torch.terms.cars import CarState
+from directshape_torch.state.cars import CarState
 from directshape_torch.terms.priors import (
     dimensions_prior,
     height_prior,
@@ -92,7 +92,7 @@ def test_pose_by_hand() -> None:
     detector = _kitti_pose(12.0, 1.6, 16.0, 0.3)
     car = _kitti_pose(12.0 + 0.6 + 0.5 * 0.8, 1.4, 16.0 + 0.8 - 0.5 * 0.6, 0.1)
     sigma = torch.tensor([[0.5, 0.25, 0.1, 0.04]], dtype=torch.float64)
-    residual = pose_prior(se3.inverse(car), detector, sigma, 0).residual
+    residual = pose_prior(se3.inverse(car), detector, sigma).residual
     torch.testing.assert_close(residual, torch.tensor([[2.0, 2.0, -2.0, -5.0]], dtype=torch.float64))
     torch.testing.assert_close(viewing_axes(detector[:, :3, 3])[0, 0], vector(0.6, 0.0, 0.8))
 
@@ -102,7 +102,7 @@ def test_pose_by_hand() -> None:
 def test_heading_against_the_detector_s_knows_no_border_at_pi(before: float, turn: float) -> None:
     after = math.remainder(before + turn, math.tau)
     detector, car = _kitti_pose(1.0, 1.6, 9.0, before), _kitti_pose(1.0, 1.6, 9.0, after)
-    result = pose_prior(se3.inverse(car), detector, torch.ones(1, 4).double(), 0)
+    result = pose_prior(se3.inverse(car), detector, torch.ones(1, 4).double())
     torch.testing.assert_close(result.residual, vector(0, 0, 0, turn)[None], atol=1e-12, rtol=0)
     # A turn of the camera's frame by omega_y about the object's own y is one of the object by -omega_y.
     torch.testing.assert_close(result.J_residual_state[0, 3], vector(0, 0, 0, 0, -1, 0))
@@ -110,6 +110,6 @@ def test_heading_against_the_detector_s_knows_no_border_at_pi(before: float, tur
 
 def test_what_the_detector_does_not_know_pulls_at_nothing() -> None:
     sigma = torch.tensor([[0.5, math.inf, math.inf, math.inf]], dtype=torch.float64)
-    result = pose_prior(se3.inverse(_kitti_pose(3.0, 1.0, 11.0, 0.5)), _kitti_pose(0.0, 1.6, 10.0, 0.3), sigma, 2)
+    result = pose_prior(se3.inverse(_kitti_pose(3.0, 1.0, 11.0, 0.5)), _kitti_pose(0.0, 1.6, 10.0, 0.3), sigma)
     torch.testing.assert_close(result.residual, torch.tensor([[2.0, 0.0, 0.0, 0.0]], dtype=torch.float64))
     assert (result.J_residual_state[0, 1:] == 0).all()

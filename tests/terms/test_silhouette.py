@@ -17,8 +17,8 @@ from torch import Tensor
 from directshape_torch.geometry import se3
 from directshape_torch.rows import ObjectRays
 from directshape_torch.shape.field import PackedField, field_of
+from directshape_torch.state.cars import CarState
 from directshape_torch.terms import silhouette
-from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.depth import closest_of_march, march
 from directshape_torch.terms.silhouette import (
     SilhouetteProducts,

@@ -18,8 +18,10 @@ from torch import Tensor
 from directshape_torch.config import TracksConfig
 from directshape_torch.geometry import se3
 from directshape_torch.solver.sharing import Groups
-from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.state.cars import CarBatch
+from directshape_torch.state.unknowns import POSE, State
 from directshape_torch.terms.priors import J_heading_omega, PriorResidual, PriorTerm
+from directshape_torch.tracks.state import PATH, TrackState
 
 NUM_PATH = 9
 MOTION_NAMES = ("path", "acceleration")
@@ -41,10 +43,13 @@ def motion_terms(config: TracksConfig, cars: CarBatch) -> list[PriorTerm]:
     """What holds views to their path, and the path to constant velocity; none where cars follow no path."""
     if not follow_paths(config, cars):
         return []
-    of_acceleration = _of_acceleration(config)
+
+    def of_acceleration(_: CarBatch, state: TrackState) -> PriorResidual:
+        return acceleration_prior(state, _of_acceleration(config))
+
     return [
-        PriorTerm(MOTION_NAMES[0], MOTION_WEIGHT, cars, partial(path_prior, config=config), 3),
-        PriorTerm(MOTION_NAMES[1], MOTION_WEIGHT, cars, lambda _, state: acceleration_prior(state, of_acceleration), 3),
+        PriorTerm(MOTION_NAMES[0], MOTION_WEIGHT, cars, partial(path_prior, config=config), 3, (POSE, PATH)),
+        PriorTerm(MOTION_NAMES[1], MOTION_WEIGHT, cars, of_acceleration, 3, (PATH,)),
     ]
 
 
@@ -65,7 +70,7 @@ def deviation_sigma(config: TracksConfig, time_s: Tensor) -> Tensor:
     return torch.hypot(here.expand(len(time_s), 3), change * time_s.abs()[:, None] ** 3 / 6)
 
 
-def path_prior(cars: CarBatch, state: CarState, config: TracksConfig) -> PriorResidual:
+def path_prior(cars: CarBatch, state: TrackState, config: TracksConfig) -> PriorResidual:
     """Place on the ground and heading against the path (B, 9), in standard deviations.
 
     Of the heading the sine: a car that a detector took for one that drives backwards pulls at nobody.
@@ -76,33 +81,29 @@ def path_prior(cars: CarBatch, state: CarState, config: TracksConfig) -> PriorRe
     turned = heading - yaw
     residual = torch.stack([place[:, 0] - x, place[:, 1] - z, torch.sin(turned)], dim=1)
     slope = torch.cos(turned)[:, None]
-    J = residual.new_zeros(len(residual), 3, state.num_unknowns)
-    J[:, :2, :3] = J_v
-    J[:, 2, 3:6] = slope * J_omega
-    first = _first_of_path(state)
+    J_pose, J_path = residual.new_zeros(len(residual), 3, 6), torch.zeros_like(state.path)[:, None].repeat(1, 3, 1)
+    J_pose[:, :2, :3] = J_v
+    J_pose[:, 2, 3:] = slope * J_omega
     for row in range(3):
-        J[:, row, first + 3 * row : first + 3 * row + 3] = -basis if row < 2 else -slope * basis
+        J_path[:, row, 3 * row : 3 * row + 3] = -basis if row < 2 else -slope * basis
+    J = torch.cat([J_pose, J_path], dim=2)
     assert cars.time_s is not None
     per_sigma = 1 / deviation_sigma(config, cars.time_s)
     return PriorResidual(residual * per_sigma, J * per_sigma[:, :, None])
 
 
-def _first_of_path(state: CarState) -> int:
-    return 6 + state.code.shape[1] + state.offset_px.shape[1]
-
-
-def acceleration_prior(state: CarState, sigma: tuple[float, float, float]) -> PriorResidual:
+def acceleration_prior(state: TrackState, sigma: tuple[float, float, float]) -> PriorResidual:
     """Acceleration of the path along x and z and of its heading, in standard deviations."""
     per_sigma = 1 / state.path.new_tensor(sigma)
-    J = state.path.new_zeros(len(state.path), 3, state.num_unknowns)
+    J = torch.zeros_like(state.path)[:, None].repeat(1, 3, 1)
     for row in range(3):
-        J[:, row, _first_of_path(state) + 3 * row + 2] = per_sigma[row]
+        J[:, row, 3 * row + 2] = per_sigma[row]
     return PriorResidual(state.path[:, 2::3] * per_sigma, J)
 
 
 def with_path(
-    config: TracksConfig, sharing: Groups, cars: CarBatch, state: CarState, say: Tensor | None = None
-) -> CarState:
+    config: TracksConfig, sharing: Groups, cars: CarBatch, state: TrackState, say: Tensor | None = None
+) -> TrackState:
     """States (R) with the path of each group that fits its views best; as they are where there is no motion prior.
 
     `say` (R,) are weights of views, by default alike.
@@ -136,13 +137,13 @@ def _continuous(sharing: Groups, time_s: Tensor, heading: Tensor) -> Tensor:
     return heading.index_put((rows[filled],), unwound[filled])
 
 
-def hold_of_path(config: TracksConfig, sharing: Groups, cars: CarBatch, alone: CarState, trusted: Tensor) -> Tensor:
+def hold_of_path(config: TracksConfig, sharing: Groups, cars: CarBatch, alone: State, trusted: Tensor) -> Tensor:
     """Factor (R,) of what deviations cost views that ended here by themselves: 1 where a path fits their track.
 
     A view that is not trusted (R,) may be far from it: the path may bring it back.
     """
     trusted = trusted | ~sharing.any(trusted)
-    fitted = with_path(config, sharing, cars, alone, torch.where(trusted, 1.0, _NEXT_TO_NOTHING))
+    fitted = with_path(config, sharing, cars, TrackState.of(alone), torch.where(trusted, 1.0, _NEXT_TO_NOTHING))
     assert cars.time_s is not None
     place, heading, _, _ = _on_the_ground(cars, fitted.T_obj_cam)
     on_path = (fitted.path.view(-1, 3, 3) * _basis(cars)[:, None]).sum(dim=2)

@@ -13,10 +13,11 @@ from helpers.problems import DEFAULT
 from helpers.synthetic_scene import CAMERA_HEIGHT_M, joined_detections, joined_frames, street
 from torch import Tensor
 
-from directshape_torch.refinement.one_car import SaidOfShape, cut_once, parts_by_shape, unlikeness
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.terms.next_view import NextView, NextViews
 from directshape_torch.terms.photometric import Photometric
+from directshape_torch.tracks.next_view import NextView, NextViews
+from directshape_torch.tracks.same_car import SaidOfShape, cut_once, parts_by_shape, unlikeness
+from directshape_torch.tracks.state import TrackState
 
 NEXT = torch.tensor([1, 1])
 
@@ -109,9 +110,9 @@ def unlike(change: str | None = None) -> Tensor:
     problem, state = refiner.problem(frames, replace(detections, mask_left=mask))
     stereo = next(term for term in problem.terms if isinstance(term, Photometric))
     term = NextView(1.0, stereo, NextViews.of(stereo.cars, NEXT))
-    state = state._replace(path=state.code.new_zeros(2, 9), T_obj_next=state.T_obj_cam[NEXT][:, None])
-    problem = replace(problem, terms=(term,), num_path=9, num_next=1)
-    sight = problem.look(state)
+    views = TrackState.of(state)._replace(T_obj_next=state.T_obj_cam[NEXT][:, None])
+    problem = replace(problem, terms=(term,))
+    sight = problem.look(views)
     (begun,) = problem.begin(problem.stages()[-1], sight).terms
     assert isinstance(begun, NextView)
     return unlikeness(begun, sight, NEXT)

@@ -7,19 +7,20 @@ view looks are too much together. Derivation: docs/derivations/tracks.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
 
-from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.sharing import said_of_shared
+from directshape_torch.state.cars import CarBatch, CarState
 from directshape_torch.status import is_refined
-from directshape_torch.terms.cars import CarBatch, CarState
-from directshape_torch.terms.next_view import NextView
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.term import Sight
+from directshape_torch.tracks.next_view import NextView
+from directshape_torch.tracks.state import own_and_shared
 
 # Evidence that the sides of a cut are of two cars is twice the cost that two shapes save, and so many times how unlike
 # the next view is; up to a limit they are of one car. Chosen on 445 cuts through rendered and real tracks of one car:
@@ -32,6 +33,10 @@ _LESS_LIKE_PER_DEG, _LESS_LIKE_BY_TURNING = 0.02, 0.25
 _FEWEST_PIXELS, _LEAST_SHARE, _UNLIKE_WITHOUT_SHARE = 20, 0.1, 0.2
 # A mask that comes so near to the border of its image is cut off.
 _BORDER_PX = 2
+
+
+Parts: TypeAlias = list[list[list[int]]]
+"""Of each track its parts, each the rows of the views of one car in the order of time."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +52,13 @@ class SaidOfShape:
     anything: Tensor  # (B,) bool: there is such a quadratic, so that it can share a shape, trusted or not
 
     @classmethod
-    def at(cls, problem: CarProblem, minimum: Minimum[CarState]) -> SaidOfShape:
+    def at(cls, minimum: Minimum[CarState]) -> SaidOfShape:
         """Of B cars where each ended by itself."""
         hessian = minimum.after.hessian.sum(dim=1)
         nothing = torch.zeros_like(hessian[:, 0])
         _, solvable = damped_step(hessian, nothing, nothing[:, 0])
         # All slopes of a minimum add up to nothing.
-        A, _, has_any = said_of_shared(hessian, nothing, *own_and_shared(problem, hessian.device))
+        A, _, has_any = said_of_shared(hessian, nothing, *own_and_shared(minimum.end))
         trusted = torch.where(is_refined(minimum.status)[:, None, None], A, 0.0)
         return cls(trusted, trusted @ minimum.end.code.to(A)[:, :, None], solvable & has_any)
 
@@ -69,13 +74,6 @@ class SaidOfShape:
 
         together = twice_least(A[-1:], b[-1:])
         return together - twice_least(A[:-1], b[:-1]) - twice_least(A[-1] - A[:-1], b[-1] - b[:-1])
-
-
-def own_and_shared(problem: CarProblem, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Numbers of a view's own unknowns, and of those of the shape."""
-    number = torch.arange(6 + problem.prior.num_codes + problem.num_offsets, device=device)
-    of_shape = (number >= 6) & (number < 6 + problem.prior.num_codes)
-    return number[~of_shape], number[of_shape]
 
 
 @torch.no_grad()
@@ -104,7 +102,7 @@ def _is_cut_off(stereo: Photometric) -> Tensor:
     return (u1 > u0) & ((u0 < _BORDER_PX) | (u1 > width - _BORDER_PX) | (v1 > height - _BORDER_PX))
 
 
-def parts_by_shape(cars: CarBatch, says: SaidOfShape, joins: Tensor) -> list[list[list[int]]]:
+def parts_by_shape(cars: CarBatch, says: SaidOfShape, joins: Tensor) -> Parts:
     """The parts of each track of B cars: rows of the views of one car, in the order of times, or of frames.
 
     Args:
@@ -126,7 +124,7 @@ def parts_by_shape(cars: CarBatch, says: SaidOfShape, joins: Tensor) -> list[lis
     return parts
 
 
-def cut_once(parts: list[list[list[int]]], says: SaidOfShape, unlike: Tensor) -> list[list[list[int]]]:
+def cut_once(parts: Parts, says: SaidOfShape, unlike: Tensor) -> Parts:
     """The parts, each cut in time where there is most evidence of two cars, if that is too much.
 
     Once, for where two cars were made one the looks of its other views suffer too. `unlike` (B,) is `unlikeness`.

@@ -22,8 +22,9 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.solver.problem import take_rows
 from directshape_torch.solver.sharing import Groups
-from directshape_torch.terms.cars import CarBatch, CarState
-from directshape_torch.terms.motion import hold_of_path, motion_terms, timed, with_path
+from directshape_torch.state.cars import CarBatch, CarState
+from directshape_torch.tracks.path import hold_of_path, motion_terms, timed, with_path
+from directshape_torch.tracks.state import TrackState
 
 CONFIG = TracksConfig()
 TIMES = torch.tensor([0.0, 0.1, 0.3, 0.4, 1.0], dtype=torch.float64)
@@ -33,16 +34,16 @@ def random(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def views(with_camera: bool, num_offsets: int = 0) -> tuple[CarBatch, CarState]:
+def views(with_camera: bool, num_offsets: int = 0) -> tuple[CarBatch, TrackState]:
     """Five views at random."""
     cars, T_obj_cam = cars_on(random(3), random(1), 5), se3.exp(random(5, 6))
     T_world_cam = se3.exp(random(5, 6, seed=1)) if with_camera else None
-    state = CarState.of(T_obj_cam, random(5, 3, seed=2))
-    state = state._replace(offset_px=random(5, num_offsets, seed=3), path=random(5, 9, seed=4))
+    offset_px, path = random(5, num_offsets, seed=3), random(5, 9, seed=4)
+    state = TrackState.of(CarState(T_obj_cam, random(5, 3, seed=2), offset_px))._replace(path=path)
     return replace(cars, time_s=TIMES, T_world_cam=T_world_cam), state
 
 
-def on_a_path(path: Tensor, T_world_cam: Tensor | None) -> CarState:
+def on_a_path(path: Tensor, T_world_cam: Tensor | None) -> TrackState:
     """States at `TIMES` on a path (9,) whose times count from their mean."""
     t = TIMES - TIMES.mean()
     x, z, yaw = (path.view(3, 3) @ torch.stack([torch.ones_like(t), t, t * t / 2])).unbind(0)
@@ -51,7 +52,7 @@ def on_a_path(path: Tensor, T_world_cam: Tensor | None) -> CarState:
     T_path_obj = se3.from_rotation_translation(R, torch.stack([x, 1.6 * one, z], dim=1))
     if T_world_cam is not None:
         T_path_obj = se3.inverse(T_world_cam) @ T_world_cam[:1] @ T_path_obj
-    return CarState.of(se3.inverse(T_path_obj), random(5, 3))
+    return TrackState.of(CarState.of(se3.inverse(T_path_obj), random(5, 3)))
 
 
 def test_a_car_may_turn_back() -> None:

@@ -12,54 +12,33 @@ from torch import Tensor
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.records import Record
 from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.state.unknowns import Unknowns, blocks_of_car
 
 
 class CarState(NamedTuple):
-    """Pose and shape of B cars, and what else is unknown of them: the tangent has these parts, in this order."""
+    """What is unknown of B cars that are refined by themselves: a `State`."""
 
     T_obj_cam: Tensor  # (B, 4, 4) left camera to object
     code: Tensor  # (B, K) standard deviations
     offset_px: Tensor  # (B, S) measured minus true disparity, full-resolution pixels; S is 1, or 0 where it is known
-    path: Tensor  # (B, N) of its track on the ground, see `terms.motion`; N is 9, or 0 where there is none
-    # (B, M, 4, 4) next view of its track to object, see `terms.next_view`; M is 1, or 0 where nobody looks there
-    T_obj_next: Tensor
 
     @classmethod
     def of(cls, T_obj_cam: Tensor, code: Tensor, num_offsets: int = 0) -> CarState:
         """Cars of a pose (B, 4, 4) and a shape (B, K), where the rig's disparity is as it is calibrated."""
         # No view of the code: compiled functions take other strides for another form.
-        offset_px, path = code.new_zeros(len(code), num_offsets), code.new_zeros(len(code), 0)
-        return cls(T_obj_cam, code, offset_px, path, code.new_zeros(len(code), 0, 4, 4))
+        return cls(T_obj_cam, code, code.new_zeros(len(code), num_offsets))
 
     @property
-    def num_unknowns(self) -> int:
-        """D = 6 + K + S + N + 6 M."""
-        return 6 + self.code.shape[1] + self.offset_px.shape[1] + self.path.shape[1] + 6 * self.T_obj_next.shape[1]
+    def unknowns(self) -> Unknowns:
+        """Blocks of the tangent `(v, omega, dcode, doffset)`.
 
-
-def retract(state: CarState, delta: Tensor, max_code: float = torch.inf, max_angle: float = torch.inf) -> CarState:
-    """`T_obj_cam <- exp(v, omega) T_obj_cam`, `code <- code + dcode`, bounded, what else there is likewise.
-
-    Args:
-        state: B cars.
-        delta: (B, 6 + K + S + N + 6 M), `(v, omega, dcode, doffset, dpath, v_next, omega_next)` in metres, radians,
-            standard deviations, pixels and the units of the path.
-        max_code: largest magnitude of a code component.
-        max_angle: no rotation is larger, radians (see `se3.exp`).
-
-    Examples:
-        >>> state = CarState.of(torch.eye(4)[None], torch.zeros(1, 2))
-        >>> retract(state, torch.tensor([[1.0, 0, 0, 0, 0, 0, 0.5, 9.0]]), max_code=3.0).code
-        tensor([[0.5000, 3.0000]])
-    """
-    has_next = state.T_obj_next.shape[1]
-    sizes = [6, state.code.shape[1], state.offset_px.shape[1], state.path.shape[1], 6 * has_next]
-    twist, code_step, offset_step, path_step, next_twist = delta.to(state.code.dtype).split_with_sizes(sizes, dim=1)
-    T_obj_cam, T_obj_next = torch.bmm(se3.exp(twist, max_angle), state.T_obj_cam), state.T_obj_next
-    if has_next:
-        T_obj_next = torch.bmm(se3.exp(next_twist, max_angle), T_obj_next[:, 0])[:, None]
-    code = (state.code + code_step).clamp(-max_code, max_code)
-    return CarState(T_obj_cam, code, state.offset_px + offset_step, state.path + path_step, T_obj_next)
+        Examples:
+            >>> state = CarState.of(torch.eye(4)[None], torch.zeros(1, 2))
+            >>> step = torch.tensor([[1.0, 0, 0, 0, 0, 0, 0.5, 9.0]])
+            >>> state.unknowns.retract(state, step, max_code=3.0).code
+            tensor([[0.5000, 3.0000]])
+        """
+        return Unknowns(blocks_of_car(self.code.shape[1], self.offset_px.shape[1]))
 
 
 def move_by_disparity(state: CarState, focal_baseline: Tensor, offset_px: float | Tensor) -> CarState:

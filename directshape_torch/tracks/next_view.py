@@ -22,8 +22,9 @@ from directshape_torch.image.interpolate import BilinearPatch, bilinear_patch
 from directshape_torch.numerics.tensors import constant_like, cross
 from directshape_torch.rows import Blocks, CarSums
 from directshape_torch.shape.field import Field
+from directshape_torch.state.cars import CarBatch
+from directshape_torch.state.unknowns import CODE, POSE, State
 from directshape_torch.terms import robust
-from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.photometric import (
     Photometric,
     Surface,
@@ -34,6 +35,7 @@ from directshape_torch.terms.photometric import (
 )
 from directshape_torch.terms.photometric_rows import CENTRE, frame_view, is_on_mask
 from directshape_torch.terms.term import Linear, Sight, Term
+from directshape_torch.tracks.state import NEXT_POSE, TrackState
 
 NEXT_VIEW_NAME = "next_view"
 # What is not so far in front of the next camera is not seen by it.
@@ -93,6 +95,7 @@ class NextView(Term):
     fixed: NextImage | None = None  # what is fixed in the stage that has begun
 
     names = (NEXT_VIEW_NAME,)
+    sees = (POSE, CODE, NEXT_POSE)
 
     @property
     def image(self) -> NextImage:
@@ -137,6 +140,7 @@ class NextView(Term):
         surface = near_surface(rows.rays, sight.field, sight.state, stereo.where(sight))
         points = surface.rays.at(surface.depth)
         at = begun._looked_up(sight.state, points)
+        assert isinstance(sight.state, TrackState)
         centre = sight.state.T_obj_next[:, 0, :3, 3][owner].mT[..., None]
         towards = points - centre
         faces_it = ((surface.normal_obj * towards).sum(0) < 0) & ~is_grazing(surface.normal_obj, towards)
@@ -149,7 +153,8 @@ class NextView(Term):
         matched = matched_brightness(form, grey[None], right, counted, owner, len(self.next_views.exists))[0]
         return replace(begun, fixed=begun.image._replace(grey=matched, weight=weight))
 
-    def _looked_up(self, state: CarState, points_obj: Tensor) -> LookedUp:
+    def _looked_up(self, state: State, points_obj: Tensor) -> LookedUp:
+        assert isinstance(state, TrackState)
         image, owner = self.image, self.blocks.owner
         T_next_obj = se3.inverse(state.T_obj_next[:, 0])[owner]
         R, t = T_next_obj[:, :3, :3], T_next_obj[:, :3, 3]
@@ -170,7 +175,7 @@ class NextView(Term):
     def where(self, sight: Sight) -> Surface:
         return self.stereo.where(sight)
 
-    def linear(self, field: Field, state: CarState, where: Surface) -> Linear:
+    def linear(self, field: Field, state: State, where: Surface) -> Linear:
         surface = near_surface(self.stereo.pixel_set.rows.rays, field, state, where)
         points = surface.rays.at(surface.depth)
         at = self._looked_up(state, points)
@@ -180,12 +185,11 @@ class NextView(Term):
         J_value_point, points = at.J_value_point.movedim(0, -1), points.movedim(0, -1)
         # The next camera sees a point that stands still in this one by both poses, with opposite signs.
         J_pose = torch.cat([J_value_point, cross(points, J_value_point)], dim=-1)
-        others = J_pose.new_zeros(*residual.shape, state.offset_px.shape[1] + state.path.shape[1])
-        J = torch.cat([J_depth[..., :6] + J_pose, J_depth[..., 6:], others, -J_pose], dim=-1)
+        J = torch.cat([J_depth + torch.nn.functional.pad(J_pose, (0, state.code.shape[1])), -J_pose], dim=-1)
         one = usable[..., None].to(J.dtype)
         return Linear(residual[..., None], one, J, surface.seen(where, surface.depth, usable))
 
-    def residual(self, field: Field, state: CarState, where: Surface) -> Tensor:
+    def residual(self, field: Field, state: State, where: Surface) -> Tensor:
         rays, owner = self.stereo.pixel_set.rows.rays.in_objects(state.T_obj_cam), self.blocks.owner
         at = self._looked_up(state, rays.at(depth_of(rays, owner, field, where)))
         lost = self.stereo.config.lost_grey_levels

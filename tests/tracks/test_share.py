@@ -28,7 +28,8 @@ from torch import Tensor
 
 from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.errors import InputError
-from directshape_torch.refinement import one_car, outcome, tracks
+from directshape_torch.refinement import outcome
+from directshape_torch.refinement import refined as refinements
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.trust import EVIDENCE_NAMES
@@ -37,8 +38,10 @@ from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.solver.sharing import Groups
+from directshape_torch.state.unknowns import POSE, AnyState
 from directshape_torch.status import Status
-from directshape_torch.terms.cars import CarState
+from directshape_torch.terms.priors import PriorTerm, height_prior
+from directshape_torch.tracks import same_car, share
 
 HEADINGS = (0.3, 1.2, 2.4)
 
@@ -146,7 +149,7 @@ def test_the_order_of_the_detections_does_not_matter() -> None:
 
 def test_a_track_of_two_cars_is_split_where_they_were_swapped(monkeypatch: pytest.MonkeyPatch) -> None:
     # The few pixels of a toy know its shape less well than those of a street.
-    monkeypatch.setattr(one_car, "_MOST_EVIDENCE", 3.0)
+    monkeypatch.setattr(same_car, "_MOST_EVIDENCE", 3.0)
     _, detections, _ = drive(contrast=2.5)
     right, swapped = (refined(detections, ids, contrast=2.5) for ids in ([0, 1] * 3, [0, 1, 0, 1, 1, 0]))
     assert right.track_part.tolist() == [0] * 6
@@ -211,7 +214,7 @@ def doubt(monkeypatch: pytest.MonkeyPatch, *in_track: int, alone: int | None = N
     """Have views of a call or a track of so many rows not trusted, together or by itself; the sizes of all calls."""
     sizes: list[int] = []
 
-    def judged(minimum: Minimum[CarState], initial: CarState, *args: Any) -> tuple[Minimum[CarState], RefinementResult]:
+    def judged(minimum: Minimum[AnyState], initial: AnyState, *args: Any) -> tuple[Minimum[AnyState], RefinementResult]:
         minimum, found = outcome.judged(minimum, initial, *args)
         sizes.append(len(minimum.status))
         rows = in_track if isinstance(minimum.stage.problem.sharing, Groups) else (alone,)
@@ -222,7 +225,7 @@ def doubt(monkeypatch: pytest.MonkeyPatch, *in_track: int, alone: int | None = N
         state = where_rows(doubtful, initial, minimum.state)
         return replace(minimum, state=state, status=status), replace(found, status_code=status)
 
-    monkeypatch.setattr(tracks, "judged", judged)
+    monkeypatch.setattr(refinements, "judged", judged)
     return sizes
 
 
@@ -251,15 +254,15 @@ def test_a_view_that_is_not_trusted_in_good_company_leaves_the_track_as_without_
 
 
 def test_a_view_that_is_not_trusted_alone_splits_no_track(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(one_car, "_MOST_EVIDENCE", 3.0)
+    monkeypatch.setattr(same_car, "_MOST_EVIDENCE", 3.0)
     _, detections, _ = drive(contrast=2.5)
     parts: list[list[list[list[int]]]] = []
 
     def recorded(*args: Any) -> list[list[list[int]]]:
-        parts.append(one_car.parts_by_shape(*args))
+        parts.append(same_car.parts_by_shape(*args))
         return parts[-1]
 
-    monkeypatch.setattr(tracks, "parts_by_shape", recorded)
+    monkeypatch.setattr(share, "parts_by_shape", recorded)
     doubt(monkeypatch, alone=4)
     refined(detections, [0, 1, 0, 1, 1, 0], contrast=2.5)
     assert parts[0] == [[[0, 2], [5]], [[1, 3, 4]]]
@@ -283,15 +286,15 @@ def test_a_view_that_is_not_trusted_in_its_track_keeps_what_it_was(monkeypatch: 
 def test_a_view_that_leaves_midway_leaves_the_track_as_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
     _, detections, _ = drive()
     without = of_tracks(0, 1, -1, 1, 0, 1)
-    minimise = tracks.minimise
+    minimise = refinements.minimise
 
-    def failing(problem: CarProblem, *others: Any) -> Minimum[CarState]:
+    def failing(problem: CarProblem, *others: Any) -> Minimum[AnyState]:
         minimum = minimise(problem, *others)
         if not isinstance(problem.sharing, Groups) or len(minimum.status) < 6:
             return minimum
         return replace(minimum, status=minimum.status.index_fill(0, torch.tensor([2]), Status.singular.code))
 
-    monkeypatch.setattr(tracks, "minimise", failing)
+    monkeypatch.setattr(refinements, "minimise", failing)
     assert_same(refined(detections, [0, 1] * 3), without)
 
 
@@ -404,3 +407,18 @@ def test_a_track_that_a_compiler_traces_ends_where_a_plain_one_does(monkeypatch:
     assert traced.track_part.tolist() == plain.track_part.tolist() == [0, 0, -1]
     torch.testing.assert_close(traced.T_cam_obj, plain.T_cam_obj, rtol=0, atol=0.02)
     torch.testing.assert_close(traced.code, plain.code, rtol=0, atol=0.1)
+
+
+def test_a_term_of_ones_own_has_another_name_than_those_of_a_track() -> None:
+    prior, (frames, detections, _) = ellipsoid_prior(), drive()
+    detections = replace(detections, track_id=torch.tensor([0, 1] * 3))
+
+    def named(name: str) -> DirectShapeRefiner:
+        def user(*scene: Any) -> PriorTerm:
+            return PriorTerm(name, 1.0, scene[2], height_prior, 1, (POSE,))
+
+        return DirectShapeRefiner(prior, DEFAULT, [user])
+
+    assert named("user")(frames, detections).term_names[-1] == "user"
+    with pytest.raises(InputError, match="extra term 'next_view': names: expected names that no column of a track has"):
+        named("next_view")(frames, detections)

@@ -18,10 +18,10 @@ from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.field import field_of
-from directshape_torch.terms.cars import CarState, retract
-from directshape_torch.terms.next_view import NextView, NextViews
 from directshape_torch.terms.photometric import Brightness, Photometric
 from directshape_torch.terms.term import Sight
+from directshape_torch.tracks.next_view import NextView, NextViews
+from directshape_torch.tracks.state import TrackState
 
 # Three views of two cars.
 NEXT = torch.tensor([2, 3, 4, 5, 4, 5])
@@ -49,29 +49,29 @@ def drive() -> tuple[FrameBatch, Detections]:
 
 def at_truth(
     frames: FrameBatch, detections: Detections, num_offsets: int = 0, config: RefinerConfig = DEFAULT
-) -> tuple[CarProblem, CarState]:
+) -> tuple[CarProblem, TrackState]:
     """The problem of the next views alone, and the true state."""
     detections = replace(detections, offset_sigma_px=torch.full((6,), 0.3).double() if num_offsets else None)
     problem, state = DirectShapeRefiner(ellipsoid_prior(), config).problem(frames, detections)
     stereo = next(term for term in problem.terms if isinstance(term, Photometric))
     term = NextView(1.0, stereo, NextViews.of(stereo.cars, NEXT))
     path = state.code.new_zeros(6, 9)
-    state = state._replace(code=CODE.repeat(3, 1), path=path, T_obj_next=state.T_obj_cam[NEXT][:, None])
-    return replace(problem, terms=(term,), num_path=9, num_next=1), state
+    views = TrackState(state.T_obj_cam, CODE.repeat(3, 1), state.offset_px, path, state.T_obj_cam[NEXT][:, None])
+    return replace(problem, terms=(term,)), views
 
 
-def begun(problem: CarProblem, state: CarState, stage: int = 1) -> tuple[NextView, Sight]:
+def begun(problem: CarProblem, state: TrackState, stage: int = 1) -> tuple[NextView, Sight]:
     sight = problem.look(state)
     (term,) = problem.begin(problem.stages()[stage], sight).terms
     assert isinstance(term, NextView)
     return term, sight
 
 
-def disturbed(state: CarState) -> CarState:
+def disturbed(state: TrackState) -> TrackState:
     """Off by centimetres; the copies of the next views' poses by others than these views, which is no matter here."""
     generator = torch.Generator().manual_seed(3)
-    delta = torch.randn(6, state.num_unknowns, generator=generator, dtype=torch.float64)
-    return retract(state, 0.01 * delta)
+    delta = torch.randn(6, state.unknowns.size, generator=generator, dtype=torch.float64)
+    return state.unknowns.retract(state, 0.01 * delta)
 
 
 def test_true_poses_and_shapes_explain_the_next_view() -> None:
@@ -79,13 +79,13 @@ def test_true_poses_and_shapes_explain_the_next_view() -> None:
     term, sight = begun(problem, state)
     counts = term.row_weight > 0
 
-    def mean_residual(at: CarState) -> float:
+    def mean_residual(at: TrackState) -> float:
         residual = term.linear(field_of(problem.prior.bind(at.code)), at, term.where(sight)).residual
         return float(residual[counts].abs().mean())
 
-    step = torch.zeros(6, state.num_unknowns, dtype=torch.float64)
+    step = torch.zeros(6, state.unknowns.size, dtype=torch.float64)
     step[:, 0] = 0.1
-    assert mean_residual(state) < 0.3 * mean_residual(retract(state, step))
+    assert mean_residual(state) < 0.3 * mean_residual(state.unknowns.retract(state, step))
     # Both cars as one body, seen by the next camera as it was: nothing tells.
     away = se3.exp(torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64))
     assert mean_residual(state._replace(T_obj_next=away @ state.T_obj_next)) > 3 * mean_residual(state)
@@ -232,7 +232,7 @@ def test_cars_keep_their_rows_when_others_leave() -> None:
     numbers = keep.nonzero()[:, 0].tolist()
     fewer = term.of_cars(keep, numbers)
     blocks = keep[term.blocks.owner]
-    there = CarState(*(x[numbers] for x in state))
+    there = TrackState(*(x[numbers] for x in state))
     where = type(term.where(sight))(*(x[..., blocks, :] for x in term.where(sight)))
     field = field_of(problem.prior.bind(state.code))
     residual = term.linear(field, state, term.where(sight)).residual[blocks]

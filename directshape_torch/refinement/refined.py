@@ -1,0 +1,79 @@
+"""Cars where a minimisation has left them, what is said of that, and the graph of the backward mode."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Generic
+
+import torch
+from torch import Tensor
+
+from directshape_torch.refinement.outcome import at_states, judged, outcome_of
+from directshape_torch.refinement.problem import CarProblem
+from directshape_torch.refinement.result import RefinementResult
+from directshape_torch.solver.differentiate import implicit_state, unrolled_state
+from directshape_torch.solver.gauss_newton import Minimum, minimise
+from directshape_torch.solver.problem import put_rows, take_rows, where_rows
+from directshape_torch.state.cars import CarBatch
+from directshape_torch.state.unknowns import AnyState
+from directshape_torch.status import Status, is_refined
+
+
+@dataclass(frozen=True)
+class Refined(Generic[AnyState]):
+    """B cars after a minimisation, with the statuses that evidence and trust give them."""
+
+    problem: CarProblem
+    cars: CarBatch
+    minimum: Minimum[AnyState]
+    found: RefinementResult  # what is said of every car where its iterations ended
+
+    @classmethod
+    def of(
+        cls, problem: CarProblem, cars: CarBatch, initial: AnyState, start: AnyState, came: RefinementResult
+    ) -> Refined[AnyState]:
+        """Minimise and judge.
+
+        Args:
+            problem: of B cars.
+            cars: these.
+            initial: input states.
+            start: where the iterations begin.
+            came: what is known of the cars beforehand.
+        """
+        repeats_steps = torch.is_grad_enabled() and problem.config.backward.mode == "unroll"
+        with torch.no_grad():
+            minimum = minimise(problem, initial, problem.config.solver, start, repeats_steps)
+            found = outcome_of(problem, minimum, cars, came)
+            return cls(problem, cars, *judged(minimum, initial, found, problem.config.acceptance))
+
+    def result(self, start: AnyState) -> RefinementResult:
+        """The result, with the graph of the backward mode."""
+        return at_states(self.found, self.states(start))
+
+    def states(self, start: AnyState, ends: Tensor | None = None) -> AnyState:
+        """Final states, with the graph of the backward mode for every car that was refined.
+
+        Args:
+            start: where the iterations began, as a function of the input.
+            ends: (B,) bool, cars that are wanted where their iterations ended, trusted or not, and no others; default
+                those that were refined.
+        """
+        minimum = self.minimum if ends is None else _at_ends(self.minimum, ends)
+        wanted = is_refined(minimum.status)
+        rows = wanted.nonzero()[:, 0]
+        if not torch.is_grad_enabled() or not len(rows):
+            return minimum.state
+        part, backward, names = self.problem.of_problems(wanted), self.problem.config.backward, self.cars.detection_row
+        if backward.mode == "unroll":
+            first = take_rows(start, rows)
+            state = unrolled_state(part, first, minimum, rows, backward.unroll_iterations, names[rows])
+        else:
+            exact, limit = backward.mode == "implicit", backward.max_remaining_step
+            state = implicit_state(part, minimum, rows, exact=exact, max_remaining_step=limit, names=names[rows])
+        return put_rows(minimum.state, rows, state)
+
+
+def _at_ends(minimum: Minimum[AnyState], ends: Tensor) -> Minimum[AnyState]:
+    status = torch.where(ends, Status.converged.code, Status.rejected_worse.code)
+    return replace(minimum, state=where_rows(ends, minimum.end, minimum.state), status=status)

@@ -1,0 +1,1 @@
+"""The state of cars: what is unknown of them, in which order, and what is known beforehand."""

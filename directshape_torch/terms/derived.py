@@ -1,0 +1,92 @@
+"""A term that has residuals alone: its Jacobian comes from automatic differentiation, as slow as that is."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import StageConfig
+from directshape_torch.errors import InputError
+from directshape_torch.rows import Blocks
+from directshape_torch.shape.field import Field
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.state.unknowns import State
+from directshape_torch.terms.robust import RobustValue
+from directshape_torch.terms.term import Linear, Sight, Term, Where, by_autograd
+
+
+def with_jacobian(term: Term, prior: ShapePrior) -> Term:
+    """The term itself where it has a `linear` of its own, else one that differentiates its `residual`."""
+    return Derived(term, prior) if inspect.getattr_static(term, "linear") is vars(Term)["linear"] else term
+
+
+@dataclass(frozen=True)
+class Derived(Term):
+    """A term without `linear`, whose rows have one residual each."""
+
+    term: Term
+    prior: ShapePrior  # whose shapes the field of a moved state is made of
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.term.names
+
+    @property
+    def sees(self) -> tuple[str, ...]:
+        return self.term.sees
+
+    @property
+    def is_prior(self) -> bool:
+        return self.term.is_prior
+
+    @property
+    def blocks(self) -> Blocks:
+        return self.term.blocks
+
+    @property
+    def column(self) -> Tensor:
+        return self.term.column
+
+    @property
+    def block_weight(self) -> Tensor:
+        return self.term.block_weight
+
+    @property
+    def information(self) -> Tensor:
+        return self.term.information
+
+    @property
+    def row_weight(self) -> Tensor:
+        return self.term.row_weight
+
+    def begin(self, stage: StageConfig, sight: Sight) -> Derived:
+        return replace(self, term=self.term.begin(stage, sight))
+
+    def moving(self, sight: Sight, after_wider: bool) -> tuple[Derived, Where, Tensor]:
+        term, where, resting = self.term.moving(sight, after_wider)
+        return replace(self, term=term), where, resting
+
+    def where(self, sight: Sight) -> Where:
+        return self.term.where(sight)
+
+    def linear(self, field: Field, state: State, where: Where) -> Linear:
+        ((residual, J),) = by_autograd([self.term], self.prior, state, [where])
+        if residual.shape[-1:] != (1,):
+            cure = "write linear(...) by hand, which may give several residuals of a row one inner scalar"
+            called = f"extra term {self.names[0]!r}: residual(...)"
+            raise InputError(called, "one residual a row, shape (M, R, 1)", f"{tuple(residual.shape)}", cure)
+        columns = state.unknowns.columns(self.sees, J.device)
+        return Linear(residual, torch.ones_like(residual), J[:, :, 0, columns], where)
+
+    def residual(self, field: Field, state: State, where: Where) -> Tensor:
+        return self.term.residual(field, state, where)
+
+    def norm(self, residual: Tensor) -> RobustValue:
+        return self.term.norm(residual)
+
+    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Derived:
+        return replace(self, term=self.term.of_cars(keep, numbers))
