@@ -12,7 +12,7 @@ import pytest
 import torch
 from helpers.derivatives import moved
 from helpers.five_cars import five_cars, step_of
-from helpers.problems import DEFAULT, MARCHED, PAPER, figures_at, photometric_of
+from helpers.problems import DEFAULT, MARCHED, PAPER, figures_at, left_of
 from helpers.problems import begun_stage as begun_at
 from helpers.synthetic_scene import cached_street, disturbed, select
 from helpers.term_cases import CLOUD, COMBINED, case
@@ -270,4 +270,4 @@ def test_a_field_that_is_known_brings_the_unbiased_energy_back() -> None:
     assert (unknown.cost > 2 * known.cost).all()
     stage, state = begun_at(prior, frames, detections)
     assert _gradient_error(stage, state, stage.problem.term_names).max() < 1e-4
-    assert (photometric_of(stage).left.pixels.bias_px == 2).all()
+    assert (left_of(stage).pixels.bias_px == 2).all()

@@ -211,7 +211,7 @@ def _of_field(end: State, cars: CarBatch) -> Tensor:
 
 def _of_calibrated_rig(problem: CarProblem, figures: Figures) -> Figures:
     """The rig's part of the information in units that the calibration of depth brings to the sigma that was given."""
-    if not any("rig" in term.names for term in problem.terms):
+    if "rig" not in problem.term_names:
         return figures
     factor = torch.ones_like(figures.term_costs)
     factor[:, problem.term_names.index("rig")] = _depth_factor() ** 2 / RIG_WEIGHT

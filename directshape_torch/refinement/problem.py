@@ -27,6 +27,7 @@ from directshape_torch.terms.priors import PriorTerm, joined
 from directshape_torch.terms.silhouette import MaskRows
 from directshape_torch.terms.term import (
     Evaluation,
+    Evidence,
     Figures,
     Part,
     Sight,
@@ -47,24 +48,19 @@ class CarProblem:
     """Minimise the sum of terms over pose and shape of B cars: a `solver.Problem`."""
 
     prior: ShapePrior  # the family of shapes
-    terms: tuple[Term, ...]  # summands of the energy
+    evidence: tuple[Evidence, ...]  # what the summands of the energy are made of
+    extra_terms: tuple[Term, ...]  # a user's own summands, whose columns come last
     masks: MaskRows  # the rays of both images, left ones first, which everything that looks at a state shares
     rays: tuple[Rays, Rays]  # of the blocks of the left and of the right image by themselves
     config: RefinerConfig  # stages, trust region, samples per ray
     # (B, T) of the columns of the terms of each car, beside their own weights; None for 1
     factors: Tensor | None = None
-    num_extra: int = 0  # how many of the terms, the last ones, are a user's own
     sharing: Sharing = INDEPENDENT  # whose shapes are one
 
     @property
     def term_names(self) -> tuple[str, ...]:
         """Of the T columns of costs."""
-        return tuple(name for term in self.terms for name in term.names)
-
-    @property
-    def extra_terms(self) -> tuple[Term, ...]:
-        """Those that are a user's own."""
-        return self.terms[len(self.terms) - self.num_extra :]
+        return tuple(name for each in (*self.evidence, *self.extra_terms) for name in each.names)
 
     def stages(self) -> list[StageConfig]:
         return method_stages(self.config)
@@ -77,7 +73,7 @@ class CarProblem:
         Ours in one function, which is compiled as a whole; terms of one's own by themselves, for what the compiler
         makes of them must not concern ours: they may mark their functions `compile.compilable`.
         """
-        own = len(terms) - self.num_extra
+        own = len(terms) - len(self.extra_terms)
         extra = zip(terms[own:], wheres[own:], strict=True)
         of_extra = tuple(part_of(term, linear_of(term, field, state, where)) for term, where in extra)
         # Compiled code has one form for both.
@@ -96,17 +92,26 @@ class CarProblem:
         stages = self.stages()
         earlier = stages[: stages.index(stage)] if stage in stages else []
         after_wider = any(other.contour_width_px > stage.contour_width_px for other in earlier)
-        terms = tuple(term.begin(stage, sight) for term in self.terms)
+        terms = tuple(each.begin(stage, sight) for each in (*self.evidence, *self.extra_terms))
         return CarStage(self, stage, terms, after_wider, sight.state.unknowns)
 
     def of_problems(self, keep: Tensor) -> CarProblem:
         """The problem of the cars where `keep` (B,) holds."""
         numbers = keep.nonzero()[:, 0].tolist()
         masks = self.masks.of_cars(keep, numbers)
-        terms = tuple(term.of_cars(keep, numbers) for term in self.terms)
+        evidence = tuple(each.of_cars(keep, numbers) for each in self.evidence)
+        extra = tuple(term.of_cars(keep, numbers) for term in self.extra_terms)
         factors = None if self.factors is None else self.factors[keep]
         sharing = self.sharing.of_problems(numbers)
-        return replace(self, terms=terms, masks=masks, rays=masks.of_sides(), factors=factors, sharing=sharing)
+        return replace(
+            self,
+            evidence=evidence,
+            extra_terms=extra,
+            masks=masks,
+            rays=masks.of_sides(),
+            factors=factors,
+            sharing=sharing,
+        )
 
 
 @dataclass(frozen=True)
@@ -189,7 +194,7 @@ class CarStage:
 
         Fewer operations; in compiled code, which has one form for this and for `figures`, they cost nothing.
         """
-        own = self.terms[: len(self.terms) - self.problem.num_extra]
+        own = self.terms[: len(self.terms) - len(self.problem.extra_terms)]
         priors = [term for term in own if isinstance(term, PriorTerm) and term.is_prior]
         if not priors or self.problem.factors is not None or will_compile():
             return self.terms

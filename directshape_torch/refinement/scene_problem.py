@@ -23,12 +23,12 @@ from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.state.cars import CarBatch, CarState
 from directshape_torch.terms.check_term import check_members, check_term, named_errors
 from directshape_torch.terms.derived import with_jacobian
-from directshape_torch.terms.photometric import Photometric
+from directshape_torch.terms.photometric import PhotometricEvidence
 from directshape_torch.terms.photometric_rows import LeftPixels
 from directshape_torch.terms.point_cloud import PointCloud
 from directshape_torch.terms.priors import prior_terms
-from directshape_torch.terms.silhouette import MaskRows, SilhouetteProducts, Silhouettes
-from directshape_torch.terms.term import Term
+from directshape_torch.terms.silhouette import MaskRows, SilhouetteEvidence
+from directshape_torch.terms.term import Evidence, Term
 
 # That of "point_cloud" holds for the methods with points, the first two for the others.
 _WEIGHTS = "silhouette.weight, photometric.weight, point_cloud.weight, priors.*_weight"
@@ -61,26 +61,23 @@ def problem_of_scene(
     pixels = observation.left, observation.right
     sides = [Rows.of_sorted(p.object_index, len(cars)) for p in pixels]
     masks = MaskRows.of_pixels(pixels, sides, config.silhouette, len(cars))
-    terms: list[Term] = []
+    evidence: list[Evidence] = []
     if observation.points is not None:
         cloud = config.point_cloud
         cloud = cloud if config.method == "geometric" else replace(cloud, weight=cloud.weight / _BESIDE_IMAGES)
-        terms += [PointCloud.of_points(cloud, observation.points)] if cloud.weight > 0 else []
+        evidence += [PointCloud.of_points(cloud, observation.points)] if cloud.weight > 0 else []
     if config.method in ("direct", "combined") and config.silhouette.weight > 0:
-        form = SilhouetteProducts if config.silhouette.form == "product" else Silhouettes
-        terms.append(form(config.silhouette, cars, masks, prior.bounds_obj, torch.ones_like(masks.filled[:, :1])))
+        evidence.append(SilhouetteEvidence(config.silhouette, cars, masks, prior.bounds_obj))
     if config.method != "geometric" and config.photometric.weight > 0:
         pyramid = _pyramid(frames, max(stage.image_level for stage in config.stages))
         left = LeftPixels.of(pixels[0], sides[0], pyramid, observation.hidden_right, detections.mask_left)
-        terms.append(Photometric(config.photometric, cars, left))
-    terms += [] if config.method == "box_alignment" else prior_terms(config.priors, prior, cars)
-    own = len(terms)
+        evidence.append(PhotometricEvidence(config.photometric, cars, left))
+    evidence += [] if config.method == "box_alignment" else prior_terms(config.priors, prior, cars)
     extra = [_made(make, frames, detections, cars, prior) for make in extra_terms]
-    terms += extra
-    if not terms:
+    if not evidence and not extra:
         raise ConfigError(f"method {config.method}: expected a term of weight above 0, got none: {_WEIGHTS}")
-    problem = CarProblem(prior, tuple(terms), masks, masks.of_sides(), config, None, len(extra))
-    _check_extra(problem, own, cars)
+    problem = CarProblem(prior, tuple(evidence), tuple(extra), masks, masks.of_sides(), config)
+    _check_extra(problem, cars)
     factors = _factors(term_weights, problem.term_names, prior.initial_code(len(detections)).to(frames.images_left))
     return problem if factors is None else replace(problem, factors=factors[cars.detection_row])
 
@@ -95,14 +92,14 @@ def _made(make: TermFactory, frames: FrameBatch, detections: Detections, cars: C
     return with_jacobian(term, prior)
 
 
-def _check_extra(problem: CarProblem, own: int, cars: CarBatch) -> None:
-    """Raise `InputError` unless the terms behind our `own` are what `Term` says, at the detector's poses."""
-    if own == len(problem.terms):
+def _check_extra(problem: CarProblem, cars: CarBatch) -> None:
+    """Raise `InputError` unless a user's terms are what `Term` says, at the detector's poses."""
+    if not problem.extra_terms:
         return
     code = problem.prior.initial_code(len(cars)).to(cars.detector_T_cam_obj)
     sight = problem.look(CarState.of(se3.inverse(cars.detector_T_cam_obj), code, cars.num_offsets))
-    names = [name for term in problem.terms[:own] for name in term.names]
-    for term in problem.terms[own:]:
+    names = [name for each in problem.evidence for name in each.names]
+    for term in problem.extra_terms:
         check_term(term, problem.stages()[0], sight, names, lambda code: field_of(problem.prior.bind(code)))
         names += term.names
 

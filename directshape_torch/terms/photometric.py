@@ -73,23 +73,59 @@ class Surface(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Photometric(Term):
-    """The term; see module. Before the first stage the pixel set is empty."""
+class PhotometricEvidence:
+    """What the images show of B cars, of which the photometric term of each stage is made: an `Evidence`."""
 
     config: PhotometricConfig  # weight and forms
     cars: CarBatch  # B cars
-    left: LeftPixels | None  # what pixel sets are made of; None where no further stage begins
-    fixed: PixelSet | None = None  # the pixel set of the stage
+    left: LeftPixels  # what pixel sets are made of
 
     names = ("photometric",)
-    sees = (POSE, CODE, OFFSET)
 
-    @property
-    def pixel_set(self) -> PixelSet:
-        """The pixels of the stage that has begun."""
-        if self.fixed is None:
-            raise RuntimeError("the photometric term has no pixel set before a stage begins: call `begin` first")
-        return self.fixed
+    def begin(self, stage: StageConfig, sight: Sight) -> Photometric:
+        left = self.left
+        rays, hits = left.rays.in_objects(sight.state.T_obj_cam), sight.hits
+        on_surface = (hits.found & ~is_grazing(hits.normal_obj, rays.direction_obj)).flatten()
+        candidates = on_surface.index_select(0, left.packed.places)
+        if self.config.pixel_set == "hit_and_mask":
+            candidates = candidates & (left.pixels.foreground > MASK_THRESHOLD)
+        chosen = candidates.nonzero()[:, 0]
+        packed = Rows.of_sorted(left.pixels.object_index[chosen], len(self.cars))
+        row = chosen[packed.row]
+        place = left.packed.places[row]
+        rows = left.rows(self.config, self.cars, packed, row, stage.image_level)
+        depth = sight.hits.depth.flatten()[place]
+        if not nothing_is_differentiated():
+            # The brightness follows the surface.
+            rays = rows.rays.in_objects(sight.state.T_obj_cam)
+            depth = surface_depth(sight.field, packed.blocks.owner, rays, depth, packed.filled)
+        warped = warped_pixels(rows, warped_depth(self.cars, depth, sight.state, packed.blocks.owner)[0])
+        right, counted = warped.at.value, (packed.filled & warped.is_comparable(rows.right)).to(depth.dtype)
+        neighbours, owner = counted * rows.neighbour_weight, packed.blocks.owner
+        form = self.config.brightness
+        matched = matched_brightness(form, rows.intensity_left, right, neighbours, owner, len(self.cars))
+        per_block = torch.stack([neighbours.sum(dim=(0, 2)), counted.sum(dim=1)], dim=1).to(torch.float64)
+        total, support = CarSums.of(owner, len(self.cars)).sum(per_block).unbind(dim=1)
+        rows = rows._replace(intensity_left=matched, pixel_weight=rows.pixel_weight * counted)
+        weight = (self.config.weight / total.clamp_min(1))[owner]
+        fixed = PixelSet(rows, packed.blocks, left.packed.blocks, place, packed.filled, weight, support)
+        return Photometric(self.config, self.cars, fixed)
+
+    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> PhotometricEvidence:
+        cars = self.cars.of_cars(keep, numbers)
+        return replace(self, cars=cars, left=self.left.of_cars(keep, len(cars)))
+
+
+@dataclass(frozen=True)
+class Photometric(Term):
+    """The term of a stage that has begun; see module."""
+
+    config: PhotometricConfig  # weight and forms
+    cars: CarBatch  # B cars
+    pixel_set: PixelSet  # the pixels of the stage
+
+    names = PhotometricEvidence.names
+    sees = (POSE, CODE, OFFSET)
 
     @property
     def blocks(self) -> Blocks:
@@ -110,64 +146,17 @@ class Photometric(Term):
         rows = self.pixel_set.rows
         return rows.pixel_weight[..., None] * rows.neighbour_weight.movedim(0, -1)
 
-    def begin(self, stage: StageConfig, sight: Sight) -> Photometric:
-        left = self.left
-        if left is None:
-            raise RuntimeError("these cars belong to a stage that has begun: begin another with the problem's term")
-        rays, hits = left.rays.in_objects(sight.state.T_obj_cam), sight.hits
-        on_surface = (hits.found & ~is_grazing(hits.normal_obj, rays.direction_obj)).flatten()
-        candidates = on_surface.index_select(0, left.packed.places)
-        if self.config.pixel_set == "hit_and_mask":
-            candidates = candidates & (left.pixels.foreground > MASK_THRESHOLD)
-        chosen = candidates.nonzero()[:, 0]
-        packed = Rows.of_sorted(left.pixels.object_index[chosen], len(self.cars))
-        row = chosen[packed.row]
-        place = left.packed.places[row]
-        rows = left.rows(self.config, self.cars, packed, row, stage.image_level)
-        depth = sight.hits.depth.flatten()[place]
-        if not nothing_is_differentiated():
-            # The brightness follows the surface.
-            rays = rows.rays.in_objects(sight.state.T_obj_cam)
-            depth = surface_depth(sight.field, packed.blocks.owner, rays, depth, packed.filled)
-        warped = warped_pixels(rows, self.warped_depth(depth, sight.state, packed.blocks.owner)[0])
-        right, counted = warped.at.value, (packed.filled & warped.is_comparable(rows.right)).to(depth.dtype)
-        neighbours, owner = counted * rows.neighbour_weight, packed.blocks.owner
-        form = self.config.brightness
-        matched = matched_brightness(form, rows.intensity_left, right, neighbours, owner, len(self.cars))
-        per_block = torch.stack([neighbours.sum(dim=(0, 2)), counted.sum(dim=1)], dim=1).to(torch.float64)
-        total, support = CarSums.of(owner, len(self.cars)).sum(per_block).unbind(dim=1)
-        rows = rows._replace(intensity_left=matched, pixel_weight=rows.pixel_weight * counted)
-        weight = (self.config.weight / total.clamp_min(1))[owner]
-        return replace(
-            self, fixed=PixelSet(rows, packed.blocks, left.packed.blocks, place, packed.filled, weight, support)
-        )
-
-    def moving(self, sight: Sight, after_wider: bool) -> tuple[Photometric, Surface, Tensor]:
-        return super(Photometric, replace(self, left=None)).moving(sight, after_wider)
-
     def where(self, sight: Sight) -> Surface:
         place = self.pixel_set.sight_place
         points, normal = (x.flatten(1)[:, place] for x in (sight.hits.points_obj, sight.hits.normal_obj))
         depth, found = (x.flatten()[place] for x in (sight.hits.depth, sight.hits.found))
-        return Surface(points, normal, self.warped_depth(depth, sight.state, self.blocks.owner)[0], found, found)
-
-    def warped_depth(self, depth: Tensor, state: State, owner: Tensor) -> tuple[Tensor, Tensor | None]:
-        """The depth (M, 64) with which pixels are warped whose surface has a depth (M, 64), and surface over warp.
-
-        `1 / warp = 1 / depth + offset / (f B)`; without an unknown offset it is the surface's, and there is no ratio.
-        """
-        if not state.offset_px.shape[1]:
-            return depth, None
-        ratio = 1 + depth * self.cars.inverse_depth_of_offset(state.offset_px)[owner]
-        # What has no disparity left goes behind the camera, where it is lost.
-        ratio = torch.where(ratio > _LEAST_SHARE, ratio, -1.0)
-        return depth / ratio, ratio
+        return Surface(points, normal, warped_depth(self.cars, depth, sight.state, self.blocks.owner)[0], found, found)
 
     def linear(self, field: Field, state: State, where: Surface) -> Linear:
         rows, owner = self.pixel_set.rows, self.blocks.owner
         surface = near_surface(rows.rays, field, state, where)
         found, J_depth_state = surface.found, surface.J_depth_state
-        depth, ratio = self.warped_depth(surface.depth, state, owner)
+        depth, ratio = warped_depth(self.cars, surface.depth, state, owner)
         if ratio is not None:
             J_depth_offset = -depth * depth * self.cars.inverse_depth_of_offset(torch.ones_like(state.offset_px))[owner]
             J_depth_state = torch.cat([J_depth_state / (ratio * ratio)[..., None], J_depth_offset[..., None]], dim=-1)
@@ -180,7 +169,7 @@ class Photometric(Term):
     def residual(self, field: Field, state: State, where: Surface) -> Tensor:
         rows = self.pixel_set.rows
         depth = depth_of(rows.rays.in_objects(state.T_obj_cam), rows.rays.owner, field, where)
-        depth, _ = self.warped_depth(depth, state, rows.rays.owner)
+        depth, _ = warped_depth(self.cars, depth, state, rows.rays.owner)
         residual, _ = residuals_at(rows, depth)
         return torch.where(where.usable[..., None], residual, self.config.lost_grey_levels)
 
@@ -189,9 +178,7 @@ class Photometric(Term):
 
     def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Photometric:
         cars = self.cars.of_cars(keep, numbers)
-        if self.fixed is None:
-            return replace(self, cars=cars, left=None if self.left is None else self.left.of_cars(keep, len(cars)))
-        fixed = self.fixed
+        fixed = self.pixel_set
         blocks, kept = fixed.blocks.of_cars(keep, numbers)
         place, filled, weight = (x.index_select(0, kept) for x in (fixed.sight_place, fixed.filled, fixed.weight))
         index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
@@ -201,7 +188,20 @@ class Photometric(Term):
         sight_blocks, _ = fixed.sight_blocks.of_cars(keep, numbers)
         rows = fixed.rows.take(kept, blocks.owner)
         of_cars = PixelSet(rows, blocks, sight_blocks, place, filled, weight, fixed.support.index_select(0, index))
-        return Photometric(self.config, cars, None, of_cars)
+        return Photometric(self.config, cars, of_cars)
+
+
+def warped_depth(cars: CarBatch, depth: Tensor, state: State, owner: Tensor) -> tuple[Tensor, Tensor | None]:
+    """The depth (M, 64) with which pixels are warped whose surface has a depth (M, 64), and surface over warp.
+
+    `1 / warp = 1 / depth + offset / (f B)`; without an unknown offset it is the surface's, and there is no ratio.
+    """
+    if not state.offset_px.shape[1]:
+        return depth, None
+    ratio = 1 + depth * cars.inverse_depth_of_offset(state.offset_px)[owner]
+    # What has no disparity left goes behind the camera, where it is lost.
+    ratio = torch.where(ratio > _LEAST_SHARE, ratio, -1.0)
+    return depth / ratio, ratio
 
 
 class NearSurface(NamedTuple):

@@ -141,16 +141,36 @@ def contour_zeta(cars: CarBatch, stage: StageConfig) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Silhouettes(Term):
-    """The term of both images, with the projection by closest approach; see module."""
+class SilhouetteEvidence:
+    """What the masks show of B cars, of which the silhouette term of each stage is made: an `Evidence`."""
 
     config: SilhouetteConfig  # weight and forms
     cars: CarBatch  # B cars
     rows: MaskRows  # their rays
     bounds_obj: Tensor  # (2, 3) of the prior
-    zeta: Tensor  # (M, 1) per metre; set when a stage begins
 
     names = ("silhouette_left", "silhouette_right")
+
+    def begin(self, stage: StageConfig, sight: Sight) -> Silhouettes:
+        form = SilhouetteProducts if self.config.form == "product" else Silhouettes
+        zeta = contour_zeta(self.cars, stage)[self.rows.rays.owner][:, None]
+        return form(self.config, self.cars, self.rows, self.bounds_obj, zeta)
+
+    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> SilhouetteEvidence:
+        return replace(self, cars=self.cars.of_cars(keep, numbers), rows=self.rows.of_cars(keep, numbers))
+
+
+@dataclass(frozen=True)
+class Silhouettes(Term):
+    """The term of both images in a stage, with the projection by closest approach; see module."""
+
+    config: SilhouetteConfig  # weight and forms
+    cars: CarBatch  # B cars
+    rows: MaskRows  # their rays
+    bounds_obj: Tensor  # (2, 3) of the prior
+    zeta: Tensor  # (M, 1) steepness of the projection, per metre
+
+    names = SilhouetteEvidence.names
 
     @property
     def blocks(self) -> Blocks:
@@ -171,9 +191,6 @@ class Silhouettes(Term):
     @property
     def row_weight(self) -> Tensor:
         return self.rows.filled[..., None]
-
-    def begin(self, stage: StageConfig, sight: Sight) -> Self:
-        return replace(self, zeta=contour_zeta(self.cars, stage)[self.rows.rays.owner][:, None])
 
     def moving(self, sight: Sight, after_wider: bool) -> tuple[Self, Where, Tensor]:
         """Rays near the contour, or that may come to be: the others are certain, whatever the next steps do."""

@@ -45,6 +45,23 @@ class Linear(NamedTuple):
     where: Where  # the points at which they were taken
 
 
+class Evidence(Protocol):
+    """What is known of B cars before the first stage, of which each stage makes a term. It never changes."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the C columns of costs that its terms fill."""
+        ...
+
+    def begin(self, stage: StageConfig, sight: Sight) -> Term:
+        """The term of a stage, with everything fixed that must not change meanwhile: pixel sets, counts, widths."""
+        ...
+
+    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Self:
+        """The evidence of the cars where `keep` (B,) holds: `numbers` of them, as the host knows it."""
+        ...
+
+
 class _FieldAlone:
     """A name without a value on the class: that of each object counts."""
 
@@ -53,8 +70,9 @@ class _FieldAlone:
 
 
 class Term(Protocol):
-    """One summand of the energy, for B cars. Terms never change: a new stage makes a new term.
+    """One summand of the energy of B cars in a stage. Terms never change.
 
+    A term whose rows are the same in all stages is its own `Evidence`.
     A subclass need not write what is here: a measurement of one column, whose rows are the same in all stages, may all
     change, and look nowhere. Fields of a dataclass may stand for properties.
     """
@@ -107,7 +125,7 @@ class Term(Protocol):
         ...
 
     def begin(self, stage: StageConfig, sight: Sight) -> Self:
-        """The term with everything fixed that must not change during a stage: pixel sets, counts, widths."""
+        """The term of a stage, which for rows that are the same in all stages is the term itself."""
         return self
 
     def moving(self, sight: Sight, after_wider: bool) -> tuple[Self, Where, Tensor]:

@@ -27,6 +27,7 @@ from directshape_torch.state.unknowns import CODE, POSE, State
 from directshape_torch.terms import robust
 from directshape_torch.terms.photometric import (
     Photometric,
+    PhotometricEvidence,
     Surface,
     depth_of,
     is_grazing,
@@ -86,23 +87,60 @@ class LookedUp(NamedTuple):
 
 
 @dataclass(frozen=True)
+class NextViewEvidence:
+    """What the left images show of B views and of the next one of each: an `Evidence`."""
+
+    weight: float  # of the term
+    stereo: PhotometricEvidence  # of the B views
+    next_views: NextViews  # of these views
+
+    names = (NEXT_VIEW_NAME,)
+
+    def begin(self, stage: StageConfig, sight: Sight) -> NextView:
+        stereo, left = self.stereo.begin(stage, sight), self.stereo.left
+        rows, owner = stereo.pixel_set.rows, stereo.blocks.owner
+        images = left.pyramid[stage.image_level]
+        scale, shift = images.scale, 0.5 * images.scale - 0.5
+        K_left = self.next_views.K_left
+        to_level = constant_like((scale, 0, shift, 0, scale, shift, 0, 0, 1), K_left).view(3, 3)
+        K = (to_level @ K_left)[owner]
+        frame = torch.cat(frame_view(images, self.next_views.frame_index[owner]), dim=1)
+        grey = rows.intensity_left[CENTRE]
+        everywhere = NextImage(images.left.reshape(-1), frame, K, grey, torch.ones_like(grey))
+        begun = NextView(self.weight, stereo, self.next_views, everywhere)
+        surface = near_surface(rows.rays, sight.field, sight.state, stereo.where(sight))
+        points = surface.rays.at(surface.depth)
+        at = begun.looked_up(sight.state, points)
+        assert isinstance(sight.state, TrackState)
+        centre = sight.state.T_obj_next[:, 0, :3, 3][owner].mT[..., None]
+        towards = points - centre
+        faces_it = ((surface.normal_obj * towards).sum(0) < 0) & ~is_grazing(surface.normal_obj, towards)
+        u, v = ((x.detach() + 0.5) / scale - 0.5 for x in (at.u, at.v))
+        on_car = is_on_mask(left.mask_left, self.next_views.detection_row[owner], u, v)
+        shown = surface.found & at.inside & faces_it & on_car
+        weight = rows.pixel_weight * (shown & self.next_views.exists[owner, None]).to(grey.dtype)
+        counted = (weight > 0).to(grey.dtype)[None]
+        form, right = stereo.config.brightness, at.value[None]
+        matched = matched_brightness(form, grey[None], right, counted, owner, len(self.next_views.exists))[0]
+        return replace(begun, image=everywhere._replace(grey=matched, weight=weight))
+
+    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> NextViewEvidence:
+        index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
+        next_views = NextViews(*(x[index] for x in self.next_views))
+        return NextViewEvidence(self.weight, self.stereo.of_cars(keep, numbers), next_views)
+
+
+@dataclass(frozen=True)
 class NextView(Term):
-    """The term; see module."""
+    """The term of a stage; see module."""
 
     weight: float  # of the term
     stereo: Photometric  # the photometric term of the B views, whose pixels and surfaces these are
     next_views: NextViews  # of these views
-    fixed: NextImage | None = None  # what is fixed in the stage that has begun
+    image: NextImage  # what the pixels are compared with
 
-    names = (NEXT_VIEW_NAME,)
+    names = NextViewEvidence.names
     sees = (POSE, CODE, NEXT_POSE)
-
-    @property
-    def image(self) -> NextImage:
-        """What the stage that has begun compares with."""
-        if self.fixed is None:
-            raise RuntimeError("the next view is not compared before a stage begins: call `begin` first")
-        return self.fixed
 
     @property
     def blocks(self) -> Blocks:
@@ -121,39 +159,8 @@ class NextView(Term):
     def row_weight(self) -> Tensor:
         return self.image.weight[..., None]
 
-    def begin(self, stage: StageConfig, sight: Sight) -> NextView:
-        stereo = self.stereo.begin(stage, sight)
-        rows, owner, left = stereo.pixel_set.rows, stereo.blocks.owner, stereo.left
-        assert left is not None
-        images = left.pyramid[stage.image_level]
-        scale, shift = images.scale, 0.5 * images.scale - 0.5
-        K_left = self.next_views.K_left
-        to_level = constant_like((scale, 0, shift, 0, scale, shift, 0, 0, 1), K_left).view(3, 3)
-        K = (to_level @ K_left)[owner]
-        frame = torch.cat(frame_view(images, self.next_views.frame_index[owner]), dim=1)
-        grey = rows.intensity_left[CENTRE]
-        begun = replace(
-            self,
-            stereo=stereo,
-            fixed=NextImage(images.left.reshape(-1), frame, K, grey, torch.ones_like(grey)),
-        )
-        surface = near_surface(rows.rays, sight.field, sight.state, stereo.where(sight))
-        points = surface.rays.at(surface.depth)
-        at = begun._looked_up(sight.state, points)
-        assert isinstance(sight.state, TrackState)
-        centre = sight.state.T_obj_next[:, 0, :3, 3][owner].mT[..., None]
-        towards = points - centre
-        faces_it = ((surface.normal_obj * towards).sum(0) < 0) & ~is_grazing(surface.normal_obj, towards)
-        u, v = ((x.detach() + 0.5) / scale - 0.5 for x in (at.u, at.v))
-        on_car = is_on_mask(left.mask_left, self.next_views.detection_row[owner], u, v)
-        shown = surface.found & at.inside & faces_it & on_car
-        weight = rows.pixel_weight * (shown & self.next_views.exists[owner, None]).to(grey.dtype)
-        counted = (weight > 0).to(grey.dtype)[None]
-        form, right = stereo.config.brightness, at.value[None]
-        matched = matched_brightness(form, grey[None], right, counted, owner, len(self.next_views.exists))[0]
-        return replace(begun, fixed=begun.image._replace(grey=matched, weight=weight))
-
-    def _looked_up(self, state: State, points_obj: Tensor) -> LookedUp:
+    def looked_up(self, state: State, points_obj: Tensor) -> LookedUp:
+        """Points (3, M, 64) of cars in their next image."""
         assert isinstance(state, TrackState)
         image, owner = self.image, self.blocks.owner
         T_next_obj = se3.inverse(state.T_obj_next[:, 0])[owner]
@@ -168,17 +175,13 @@ class NextView(Term):
         J_u, J_v = ((P[n] - w * P[2]) * inverse_z for n, w in ((0, u), (1, v)))
         return LookedUp(u, v, at.value, at.d_u * J_u + at.d_v * J_v, at.inside & in_front)
 
-    def moving(self, sight: Sight, after_wider: bool) -> tuple[NextView, Surface, Tensor]:
-        stereo, where, nothing = self.stereo.moving(sight, after_wider)
-        return replace(self, stereo=stereo), where, nothing
-
     def where(self, sight: Sight) -> Surface:
         return self.stereo.where(sight)
 
     def linear(self, field: Field, state: State, where: Surface) -> Linear:
         surface = near_surface(self.stereo.pixel_set.rows.rays, field, state, where)
         points = surface.rays.at(surface.depth)
-        at = self._looked_up(state, points)
+        at = self.looked_up(state, points)
         usable = surface.found & at.inside
         residual = torch.where(usable, at.value - self.image.grey, self.stereo.config.lost_grey_levels)
         J_depth = (at.J_value_point * surface.rays.direction_obj).sum(0)[..., None] * surface.J_depth_state
@@ -191,7 +194,7 @@ class NextView(Term):
 
     def residual(self, field: Field, state: State, where: Surface) -> Tensor:
         rays, owner = self.stereo.pixel_set.rows.rays.in_objects(state.T_obj_cam), self.blocks.owner
-        at = self._looked_up(state, rays.at(depth_of(rays, owner, field, where)))
+        at = self.looked_up(state, rays.at(depth_of(rays, owner, field, where)))
         lost = self.stereo.config.lost_grey_levels
         return torch.where(where.usable, at.value - self.image.grey, lost)[..., None]
 
@@ -205,7 +208,7 @@ class NextView(Term):
         are of one car all the same. Behind it how many pixels (B,) are seen in both.
         """
         where, owner, image = self.where(sight), self.blocks.owner, self.image
-        at = self._looked_up(sight.state, where.points_obj)
+        at = self.looked_up(sight.state, where.points_obj)
         in_both = (where.usable & at.inside & (image.weight > 0)).to(torch.float64)
         sums = CarSums.of(owner, len(self.next_views.exists))
 
@@ -230,8 +233,6 @@ class NextView(Term):
     def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> NextView:
         index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
         next_views, stereo = NextViews(*(x[index] for x in self.next_views)), self.stereo.of_cars(keep, numbers)
-        if self.fixed is None:
-            return NextView(self.weight, stereo, next_views)
         _, kept = self.blocks.of_cars(keep, numbers)
-        fixed = NextImage(self.fixed.pixels, *(x.index_select(0, kept) for x in self.fixed[1:]))
-        return NextView(self.weight, stereo, next_views, fixed)
+        image = NextImage(self.image.pixels, *(x.index_select(0, kept) for x in self.image[1:]))
+        return NextView(self.weight, stereo, next_views, image)

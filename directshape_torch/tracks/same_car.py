@@ -17,7 +17,7 @@ from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.sharing import said_of_shared
 from directshape_torch.state.cars import CarBatch, CarState
 from directshape_torch.status import is_refined
-from directshape_torch.terms.photometric import Photometric
+from directshape_torch.terms.photometric import PhotometricEvidence
 from directshape_torch.terms.term import Sight
 from directshape_torch.tracks.next_view import NextView
 from directshape_torch.tracks.state import own_and_shared
@@ -77,8 +77,11 @@ class SaidOfShape:
 
 
 @torch.no_grad()
-def unlikeness(term: NextView, seen_end: Sight, next_view: Tensor) -> Tensor:
-    """How much less like the next (B,) each of B views of tracks is than a turning car explains; 0 if nobody knows."""
+def unlikeness(term: NextView, is_cut: Tensor, seen_end: Sight, next_view: Tensor) -> Tensor:
+    """How much less like the next (B,) each of B views of tracks is than a turning car explains; 0 if nobody knows.
+
+    The image ends within the mask of views that are cut, `is_cut` (B,).
+    """
     alike, count = term.likeness(seen_end)
     towards = torch.nn.functional.normalize(seen_end.state.T_obj_cam[:, :3, 3], dim=1)
     turned_deg = (towards * towards[next_view]).sum(dim=1).clamp(-1, 1).arccos().rad2deg()
@@ -89,14 +92,13 @@ def unlikeness(term: NextView, seen_end: Sight, next_view: Tensor) -> Tensor:
     nothing_shared = (support >= _FEWEST_PIXELS) & (count < _LEAST_SHARE * support)
     unlike = torch.where(nothing_shared, _UNLIKE_WITHOUT_SHARE, unlike)
     # A car that the image cuts off may be placed wrongly along the cut.
-    whole = ~_is_cut_off(term.stereo)
+    whole = ~is_cut
     return torch.where(term.next_views.exists & whole & whole[next_view], unlike, 0.0)
 
 
-def _is_cut_off(stereo: Photometric) -> Tensor:
+def is_cut_off(stereo: PhotometricEvidence) -> Tensor:
     """Whether (B,) the left image ends within the mask of each car, at the left or right or below."""
     left, cars = stereo.left, stereo.cars
-    assert left is not None
     height, width = left.pyramid[0].sizes[cars.frame_index].unbind(1)
     u0, _, u1, v1 = left.mask_left.extents[cars.detection_row].unbind(1)
     return (u1 > u0) & ((u0 < _BORDER_PX) | (u1 > width - _BORDER_PX) | (v1 > height - _BORDER_PX))

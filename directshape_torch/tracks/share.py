@@ -22,11 +22,11 @@ from directshape_torch.solver.sharing import Groups
 from directshape_torch.state.cars import CarBatch, CarState
 from directshape_torch.state.unknowns import CODE
 from directshape_torch.status import Status, is_refined
-from directshape_torch.terms.photometric import Photometric
-from directshape_torch.terms.term import Term
-from directshape_torch.tracks.next_view import NextView, NextViews
+from directshape_torch.terms.photometric import PhotometricEvidence
+from directshape_torch.terms.term import Evidence
+from directshape_torch.tracks.next_view import NextView, NextViewEvidence, NextViews
 from directshape_torch.tracks.path import hold_of_path, motion_terms, timed, with_path
-from directshape_torch.tracks.same_car import Parts, SaidOfShape, cut_once, parts_by_shape, unlikeness
+from directshape_torch.tracks.same_car import Parts, SaidOfShape, cut_once, is_cut_off, parts_by_shape, unlikeness
 from directshape_torch.tracks.state import NEXT_POSE, PATH, TrackState, own_and_shared
 
 # Of a track, times those of the last stage.
@@ -163,9 +163,11 @@ class Views:
         minimum = in_track.minimum
         nothing = torch.zeros(len(self.keep), dtype=minimum.after.cost.dtype, device=self.keep.device)
         term = next((term for term in minimum.stage.terms if isinstance(term, NextView)), None)
-        if term is None:
+        stereo = _photometric(self.problem)
+        if term is None or stereo is None:
             return nothing
-        return nothing.index_copy(0, self.rows, unlikeness(term, minimum.seen_end, self.next_view))
+        unlike = unlikeness(term, is_cut_off(stereo), minimum.seen_end, self.next_view)
+        return nothing.index_copy(0, self.rows, unlike)
 
     def part_of(self, status: Tensor) -> Tensor:
         """The part of its track (R,), -1 for a view that ends with a shape of its own: no other was refined."""
@@ -181,7 +183,11 @@ def _linked(problem: CarProblem, sharing: Groups, views: CarBatch, alone: CarSta
 
 
 def _looks_at_next(problem: CarProblem) -> bool:
-    return problem.config.tracks.next_view_weight > 0 and any(isinstance(term, Photometric) for term in problem.terms)
+    return problem.config.tracks.next_view_weight > 0 and _photometric(problem) is not None
+
+
+def _photometric(problem: CarProblem) -> PhotometricEvidence | None:
+    return next((each for each in problem.evidence if isinstance(each, PhotometricEvidence)), None)
 
 
 def in_tracks(
@@ -198,27 +204,26 @@ def in_tracks(
     # Views that look at each other take more steps to settle.
     last = replace(last, max_iterations=_MORE_ITERATIONS * last.max_iterations)
     config = replace(problem.config, stages=(last,))
-    terms: list[Term] = [*motion_terms(config.tracks, views)]
+    added: list[Evidence] = [*motion_terms(config.tracks, views)]
     columns: list[Tensor] = []
-    if terms:
+    if added:
         # A track has one acceleration, whoever its views are.
         hold = hold_of_path(config.tracks, sharing, views, alone, trusted)
         columns = [hold, 1 / sharing.total(one, sharing.everybody)]
-    stereo = next((term for term in problem.terms if isinstance(term, Photometric)), None)
+    stereo = _photometric(problem)
     if stereo is not None and _looks_at_next(problem):
-        terms.append(NextView(config.tracks.next_view_weight, stereo, NextViews.of(views, next_view)))
+        added.append(NextViewEvidence(config.tracks.next_view_weight, stereo, NextViews.of(views, next_view)))
         columns.append(one)
-    for name in (name for term in terms for name in term.names if name in problem.term_names):
+    for name in (name for each in added for name in each.names if name in problem.term_names):
         raise InputError(f"extra term {name!r}: names", "names that no column of a track has", repr(name))
-    own = len(problem.terms) - problem.num_extra
-    before = sum(len(term.names) for term in problem.terms[:own])
+    before = sum(len(each.names) for each in problem.evidence)
     unknowns, device = _linked(problem, sharing, views, alone, next_view).unknowns, alone.code.device
     shared = torch.cat([sharing.shared, unknowns.columns((PATH,), device)])
     of_next = unknowns.columns((NEXT_POSE,), device)
     return replace(
         problem,
         config=config,
-        terms=(*problem.terms[:own], *terms, *problem.terms[own:]),
+        evidence=(*problem.evidence, *added),
         factors=torch.cat([factors[:, :before], *(x[:, None] for x in columns), factors[:, before:]], dim=1),
         sharing=Groups.of(sharing.group, sharing.own, shared, of_next, sharing.place),
     )

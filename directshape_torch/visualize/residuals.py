@@ -19,6 +19,7 @@ from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.rows import PixelSamples, Rows
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.state.cars import CarState
 from directshape_torch.terms.photometric import Photometric, Surface
@@ -79,7 +80,7 @@ def car_residuals(stage: CarStage, pixels: Observation, sight: Sight) -> list[Ca
                 signed = torch.where(of_side.foreground > 0.5, -value, value)
                 parts[term.names[side]] = of_side.object_index, of_side.uv, signed, torch.zeros_like(value).bool()
         elif isinstance(term, Photometric):
-            parts["photometric"] = _of_photometry(term, at)
+            parts["photometric"] = _of_photometry(term, at, pixels.left)
     return [
         CarResiduals(*(_of_car(parts[name], car) for name in CarResiduals._fields))
         for car in range(len(sight.state.code))
@@ -91,15 +92,15 @@ def _of_car(pixels: _Pixels, car: int) -> PixelResiduals:
     return PixelResiduals(uv.astype(np.float64), value.astype(np.float64), lost)
 
 
-def _of_photometry(term: Photometric, at: Part) -> _Pixels:
-    fixed, left = term.pixel_set, term.left
-    assert left is not None, "a stage of all cars has all pixels"
+def _of_photometry(term: Photometric, at: Part, left: PixelSamples) -> _Pixels:
+    fixed = term.pixel_set
     counted = fixed.rows.pixel_weight > 0
     weight = fixed.rows.neighbour_weight.movedim(0, -1)
     mean = (at.residual * weight).sum(dim=-1) / weight.sum(dim=-1).clamp_min(1)
-    pixel = left.packed.row.flatten()[fixed.sight_place]
+    # A sight has the left pixels in the blocks into which they are packed.
+    pixel = Rows.of_sorted(left.object_index, len(term.cars)).row.flatten()[fixed.sight_place]
     car = fixed.blocks.owner[:, None].expand_as(counted)
-    return car[counted], left.pixels.uv[pixel[counted]], mean[counted], ~Surface(*at.where).usable[counted]
+    return car[counted], left.uv[pixel[counted]], mean[counted], ~Surface(*at.where).usable[counted]
 
 
 @torch.no_grad()

@@ -53,7 +53,7 @@ TARGETS: dict[str, Target] = {
     ),
     "photometric": Target(
         "directshape_torch/terms/photometric.py",
-        ("Photometric.linear", "Photometric.residual", "Photometric.warped_depth", "near_surface", "depth_of"),
+        ("Photometric.linear", "Photometric.residual", "warped_depth", "near_surface", "depth_of"),
         (*_OFFSET, *_GRADIENTS, f"{_LABORATORY}::test_a_tracked_pixel_ends_on_the_surface"),
     ),
     "photometric_rows": Target(
@@ -89,7 +89,7 @@ TARGETS: dict[str, Target] = {
     ),
     "next_view": Target(
         "directshape_torch/tracks/next_view.py",
-        ("NextView.linear", "NextView.residual", "NextView._looked_up"),
+        ("NextView.linear", "NextView.residual", "NextView.looked_up"),
         (*_TRACK, "tests/tracks/test_next_view.py"),
     ),
     "robust": Target(
@@ -242,7 +242,7 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
         Equivalent("part_of_rows", text, f"(-{text})", "the iterations, whose witness it is, never ask for it")
         for text in ("products[:, :-1]", "residual")
     ),
-    Equivalent("Photometric.warped_depth", "ratio", "(-ratio)", _IN_PAIRS),
+    Equivalent("warped_depth", "ratio", "(-ratio)", _IN_PAIRS),
     Equivalent("_Layout.of", "terms[0]", "terms[1]", "all terms are of the same cars"),
     Equivalent("GridField.at_corners", "k * z", "(k)", "the stride of the last axis is one"),
     *(

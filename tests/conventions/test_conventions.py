@@ -16,7 +16,7 @@ import torch
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.ground import cars_on
 from helpers.lookup import bilinear_with_gradient
-from helpers.problems import DEFAULT, begun_stage, figures_at, photometric_of
+from helpers.problems import DEFAULT, begun_stage, figures_at, left_of, photometric_of
 from helpers.synthetic_scene import cached_street, disturbed
 from kornia.geometry.liegroup import So3
 from torch import Tensor
@@ -332,9 +332,9 @@ def test_25_letters() -> None:
     B, K_, F = len(scene.detections), prior.num_codes, len(scene.frames)
     D, S, N = 6 + K_, DEFAULT.silhouette.samples_per_ray, len(DSO_PATTERN)
     term, sight = photometric_of(stage), stage.problem.look(state)
-    P = len(term.left.pixels)
+    P = len(left_of(stage).pixels)
     H, W = scene.frames.images_left.shape[2:]
-    assert term.left.pixels.uv.shape == (P, 2)
+    assert left_of(stage).pixels.uv.shape == (P, 2)
     owner, rays = stage.problem.rays[0].owner, stage.problem.rays[0].in_objects(state.T_obj_cam)
     assert march(sight.field, owner, rays, prior.bounds_obj, S).sdf.shape == (S, len(owner), 64)
     assert len(term.pixel_set.rows.intensity_left) == N == 8
@@ -351,7 +351,7 @@ def test_26_systems_are_float64() -> None:
     )
     _, at = stage.start(stage.problem.look(state))
     assert at.cost.dtype == at.gradient.dtype == at.hessian.dtype == torch.float64
-    assert photometric_of(stage).left.pixels.uv.dtype == state.code.dtype == torch.float32
+    assert left_of(stage).pixels.uv.dtype == state.code.dtype == torch.float32
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -78,7 +78,7 @@ def test_the_jacobian_of_the_upright_prior_is_right() -> None:
     exact = load_config(None, ["rig.disparity_sigma_px=0"])
     problem, state = DirectShapeRefiner(None, exact, [of["upright_prior"]]).problem(*_demo(of))
     state = state.unknowns.retract(state, 0.2 * torch.randn(len(state.code), state.unknowns.size))
-    term = problem.terms[problem.term_names.index("upright") - len(problem.term_names)]
+    (term,) = problem.extra_terms
     at = linear_of(term, field_of(problem.prior.bind(state.code)), state, ())
     ((residual, jacobian),) = by_autograd([term], problem.prior, state, [()])
     torch.testing.assert_close(at.residual, residual)

@@ -14,7 +14,8 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.state.cars import CarState
-from directshape_torch.terms.photometric import Photometric
+from directshape_torch.terms.photometric import Photometric, PhotometricEvidence
+from directshape_torch.terms.photometric_rows import LeftPixels
 from directshape_torch.terms.term import Figures
 
 DEFAULT = RefinerConfig(
@@ -65,6 +66,11 @@ def photometric_of(stage: CarStage) -> Photometric:
     """The photometric term of a stage that has one."""
     assert stage.photometric is not None
     return stage.photometric
+
+
+def left_of(stage: CarStage) -> LeftPixels:
+    """The left pixels of which the photometric term of a stage is made."""
+    return next(each.left for each in stage.problem.evidence if isinstance(each, PhotometricEvidence))
 
 
 def with_code(state: CarState, code: Any) -> CarState:

@@ -8,7 +8,7 @@ from torch import Tensor
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.state.cars import CarState
 from directshape_torch.terms.photometric import Photometric
-from directshape_torch.terms.photometric_rows import DSO_PATTERN
+from directshape_torch.terms.photometric_rows import DSO_PATTERN, LeftPixels
 from reference.rays import RaysObj, first_entry
 
 # From the prior's bounds: so far away the closest approach stays of them, where the field has a kink.
@@ -35,28 +35,28 @@ def bilinear(image: Tensor, u: Tensor, v: Tensor) -> Tensor:
     return (1 - b) * upper + b * lower
 
 
-def photometric(term: Photometric, level: int, depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def photometric(term: Photometric, pixels: LeftPixels, level: int, depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Plain residuals (M, R, 8) at depths (M, R), without any match of brightness: `I_r(warp(p~, d_p)) - I_l(p~)`.
 
     Also the pixels (M, R, 8, 2) where the neighbours land in the right image, and their depth there.
     """
-    images, fixed = term.left.pyramid[level], term.pixel_set
+    images, fixed = pixels.pyramid[level], term.pixel_set
     residual = torch.zeros(*depth.shape, 8, dtype=depth.dtype)
     landed = torch.zeros(*depth.shape, 8, 2, dtype=depth.dtype)
     in_front = torch.zeros(*depth.shape, 8, dtype=depth.dtype)
-    row = term.left.packed.row.flatten()[fixed.sight_place]
+    row = pixels.packed.row.flatten()[fixed.sight_place]
     for block, car in enumerate(fixed.blocks.owner.tolist()):
         frame, own = term.cars.frame_index[car], row[block]
         height, width = images.sizes[frame].tolist()
         left, right = (image[frame, :height, :width] for image in (images.left, images.right))
         for number, offset in enumerate(DSO_PATTERN):
-            uv_level = (term.left.pixels.uv[own] + 0.5) * images.scale - 0.5 + torch.tensor(offset)
+            uv_level = (pixels.pixels.uv[own] + 0.5) * images.scale - 0.5 + torch.tensor(offset)
             homogeneous = torch.cat([(uv_level + 0.5) / images.scale - 0.5, torch.ones_like(uv_level[:, :1])], dim=1)
             point_left = depth[block, :, None] * (torch.linalg.inv(term.cars.K_left[car]) @ homogeneous.mT).mT
             T = term.cars.T_right_cam[car]
             x, y, z = (term.cars.K_right[car] @ (T[:3, :3] @ point_left.mT + T[:3, 3:])).unbind(0)
-            u = (x / z - term.left.pixels.bias_px[own] + 0.5) * images.scale - 0.5
-            v = (y / z + term.left.pixels.vertical_px[own] + 0.5) * images.scale - 0.5
+            u = (x / z - pixels.pixels.bias_px[own] + 0.5) * images.scale - 0.5
+            v = (y / z + pixels.pixels.vertical_px[own] + 0.5) * images.scale - 0.5
             residual[block, :, number] = bilinear(right, u, v) - bilinear(left, *uv_level.unbind(1))
             landed[block, :, number], in_front[block, :, number] = torch.stack([u, v], dim=1), z
     return residual, landed, in_front

@@ -17,6 +17,7 @@ from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.terms.photometric import warped_depth
 from directshape_torch.terms.priors import rig_prior
 
 UNSURE = replace(DEFAULT, rig=RigConfig(disparity_sigma_px=1.0))
@@ -79,9 +80,8 @@ def test_warp_and_prior_by_hand() -> None:
     cars = replace(term.cars, T_right_cam=T_right_cam, offset_sigma_px=sigma_px)
     owner, depth = torch.tensor([0, 1]), torch.full((2, 1), 8.0).double()
     nearer, gone = (state._replace(offset_px=torch.full((2, 1), x).double()) for x in (2.0, -10.0))
-    by_hand = replace(term, cars=cars)
-    torch.testing.assert_close(by_hand.warped_depth(depth, nearer, owner)[0], torch.tensor([[80 / 12], [8.0]]).double())
-    assert (by_hand.warped_depth(depth, gone, owner)[0] < 0).tolist() == [[True], [False]]
+    torch.testing.assert_close(warped_depth(cars, depth, nearer, owner)[0], torch.tensor([[80 / 12], [8.0]]).double())
+    assert (warped_depth(cars, depth, gone, owner)[0] < 0).tolist() == [[True], [False]]
     prior = rig_prior(cars, nearer)
     assert prior.residual.tolist() == [[4.0], [2.0]]
     assert prior.J_residual_state.tolist() == [[[2.0]], [[1.0]]]

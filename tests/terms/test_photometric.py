@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers.ellipsoids import ellipsoid_prior
-from helpers.problems import CONFIGS, DEFAULT, PAPER, begun_stage, figures_at, photometric_of
+from helpers.problems import CONFIGS, DEFAULT, PAPER, begun_stage, figures_at, left_of, photometric_of
 from helpers.synthetic_scene import cached_street, disturbed, street
 from helpers.term_cases import case
 from reference import residuals as reference
@@ -43,15 +43,15 @@ def test_residuals_at_any_depth_are_the_references_and_have_its_slope(regime: st
     rows, level = term.pixel_set.rows, stage.config.image_level
     depth = term.cars.input_depth[rows.rays.owner][:, None] * (1 + 0.1 * torch.rand_like(rows.pixel_weight))
     at = compared(rows, depth)
-    expected, landed, in_front = reference.photometric(term, level, depth)
-    size = term.left.pyramid[level].sizes[0]
+    expected, landed, in_front = reference.photometric(term, left_of(stage), level, depth)
+    size = left_of(stage).pyramid[level].sizes[0]
     inside = ((landed >= 0) & (landed <= size.flip(0) - 1)).all(-1) & (in_front > 0)
     counted = at.comparable & (rows.pixel_weight > 0)
     assert counted.double().mean() > 0.3
     assert inside.all(-1)[counted].all()
     torch.testing.assert_close(at.residual[counted], expected[counted], rtol=1e-9, atol=1e-8)
     step = 1e-6 * depth.mean()
-    ends = [reference.photometric(term, level, depth + sign * step)[0] for sign in (1, -1)]
+    ends = [reference.photometric(term, left_of(stage), level, depth + sign * step)[0] for sign in (1, -1)]
     error = ((ends[0] - ends[1]) / (2 * step) - at.J_residual_depth)[counted].abs()
     # A step that crosses into the next pixel sees another slope.
     assert (error < 1e-4 * at.J_residual_depth.abs().max()).double().mean() > 0.995
@@ -92,7 +92,7 @@ def test_a_pixel_that_leaves_the_right_image_pays_the_constant() -> None:
     sight = stage.problem.look(nearer)
     at = term.linear(sight.field, nearer, term.where(sight))
     depth, found = reference.surface_depth(stage.problem.prior, term, nearer)
-    _, landed, _ = reference.photometric(term, 0, torch.where(found, depth, 1.0))
+    _, landed, _ = reference.photometric(term, left_of(stage), 0, torch.where(found, depth, 1.0))
     left_image = found & (landed[..., 0] < -0.5).any(-1) & (term.pixel_set.rows.pixel_weight > 0)
     assert left_image.any()
     assert (at.residual[left_image] == term.config.lost_grey_levels).all()
@@ -118,7 +118,7 @@ def test_a_pixel_that_lands_on_a_nearer_cars_mask_is_not_compared() -> None:
         support.append(term.pixel_set.support)
         if occlusion:
             depth, _ = reference.surface_depth(prior, term, state)
-            _, landed, _ = reference.photometric(term, 0, depth)
+            _, landed, _ = reference.photometric(term, left_of(stage), 0, depth)
             far = (term.blocks.owner == 1)[:, None] & (term.pixel_set.rows.pixel_weight > 0)
             u, v = landed[..., DSO_PATTERN.index((0, 0)), :][far].round().long().unbind(-1)
             assert (scene.detections.mask_right.dense()[0, v, u] < 0.5).all()
@@ -132,11 +132,11 @@ def test_pixel_sets_and_their_weights() -> None:
         stage, _ = _stage(config)
         term = photometric_of(stage)
         counted = term.pixel_set.rows.pixel_weight > 0
-        own = term.left.packed.row.flatten()[term.pixel_set.sight_place][counted]
-        assert bool((term.left.pixels.foreground[own] > 0.5).all()) is needs_mask
+        own = left_of(stage).packed.row.flatten()[term.pixel_set.sight_place][counted]
+        assert bool((left_of(stage).pixels.foreground[own] > 0.5).all()) is needs_mask
         assert int(counted.sum()) == int(term.pixel_set.support.sum())
         c2 = GRADIENT_CONSTANT**2
-        expected = c2 / (c2 + term.left.pixels.gradient_magnitude[own] ** 2)
+        expected = c2 / (c2 + left_of(stage).pixels.gradient_magnitude[own] ** 2)
         torch.testing.assert_close(term.pixel_set.rows.pixel_weight[counted], expected)
 
 

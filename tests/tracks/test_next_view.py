@@ -18,9 +18,9 @@ from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.field import field_of
-from directshape_torch.terms.photometric import Brightness, Photometric
+from directshape_torch.terms.photometric import Brightness, PhotometricEvidence
 from directshape_torch.terms.term import Sight
-from directshape_torch.tracks.next_view import NextView, NextViews
+from directshape_torch.tracks.next_view import NextView, NextViewEvidence, NextViews
 from directshape_torch.tracks.state import TrackState
 
 # Three views of two cars.
@@ -53,11 +53,11 @@ def at_truth(
     """The problem of the next views alone, and the true state."""
     detections = replace(detections, offset_sigma_px=torch.full((6,), 0.3).double() if num_offsets else None)
     problem, state = DirectShapeRefiner(ellipsoid_prior(), config).problem(frames, detections)
-    stereo = next(term for term in problem.terms if isinstance(term, Photometric))
-    term = NextView(1.0, stereo, NextViews.of(stereo.cars, NEXT))
+    stereo = next(each for each in problem.evidence if isinstance(each, PhotometricEvidence))
+    evidence = NextViewEvidence(1.0, stereo, NextViews.of(stereo.cars, NEXT))
     path = state.code.new_zeros(6, 9)
     views = TrackState(state.T_obj_cam, CODE.repeat(3, 1), state.offset_px, path, state.T_obj_cam[NEXT][:, None])
-    return replace(problem, terms=(term,)), views
+    return replace(problem, evidence=(evidence,)), views
 
 
 def begun(problem: CarProblem, state: TrackState, stage: int = 1) -> tuple[NextView, Sight]:
@@ -239,6 +239,6 @@ def test_cars_keep_their_rows_when_others_leave() -> None:
     of_fewer = fewer.linear(field_of(problem.prior.bind(there.code)), there, where).residual
     torch.testing.assert_close(of_fewer, residual, rtol=1e-9, atol=1e-9)
     # Before a stage begins too.
-    whole = problem.terms[0].of_cars(keep, numbers)
-    assert isinstance(whole, NextView)
+    whole = problem.evidence[0].of_cars(keep, numbers)
+    assert isinstance(whole, NextViewEvidence)
     assert whole.next_views.detection_row.tolist() == NEXT[numbers].tolist()

@@ -14,9 +14,9 @@ from helpers.synthetic_scene import CAMERA_HEIGHT_M, joined_detections, joined_f
 from torch import Tensor
 
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.terms.photometric import Photometric
-from directshape_torch.tracks.next_view import NextView, NextViews
-from directshape_torch.tracks.same_car import SaidOfShape, cut_once, parts_by_shape, unlikeness
+from directshape_torch.terms.photometric import PhotometricEvidence
+from directshape_torch.tracks.next_view import NextView, NextViewEvidence, NextViews
+from directshape_torch.tracks.same_car import SaidOfShape, cut_once, is_cut_off, parts_by_shape, unlikeness
 from directshape_torch.tracks.state import TrackState
 
 NEXT = torch.tensor([1, 1])
@@ -108,14 +108,14 @@ def unlike(change: str | None = None) -> Tensor:
         mask[1, :, : of_next + 3] = 0
     refiner = DirectShapeRefiner(ellipsoid_prior(), DEFAULT)
     problem, state = refiner.problem(frames, replace(detections, mask_left=mask))
-    stereo = next(term for term in problem.terms if isinstance(term, Photometric))
-    term = NextView(1.0, stereo, NextViews.of(stereo.cars, NEXT))
+    stereo = next(each for each in problem.evidence if isinstance(each, PhotometricEvidence))
+    evidence = NextViewEvidence(1.0, stereo, NextViews.of(stereo.cars, NEXT))
     views = TrackState.of(state)._replace(T_obj_next=state.T_obj_cam[NEXT][:, None])
-    problem = replace(problem, terms=(term,))
+    problem = replace(problem, evidence=(evidence,))
     sight = problem.look(views)
     (begun,) = problem.begin(problem.stages()[-1], sight).terms
     assert isinstance(begun, NextView)
-    return unlikeness(begun, sight, NEXT)
+    return unlikeness(begun, is_cut_off(stereo), sight, NEXT)
 
 
 @pytest.mark.parametrize(
