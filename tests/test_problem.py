@@ -95,7 +95,7 @@ def _ended(problem: CarProblem, state: CarState, start: CarState | None = None) 
 def test_the_cost_that_accepts_is_the_one_whose_gradient_made_it(name: str) -> None:
     """At the input and at the end; before, with the vertex of coarse samples: 5 percent in the median, 44 at most."""
     problem, state = DirectShapeRefiner(PCAShapePrior.load_bundled().double()).problem(*_first_frame_of(name))
-    last = problem.begin(problem.stages()[-1], problem.look(state))
+    last = problem.begin(-1, problem.look(state))
     ended = _ended(problem, state)
     assert isinstance(ended.stage, CarStage)
     silhouettes = "silhouette_left", "silhouette_right"
@@ -271,3 +271,12 @@ def test_a_field_that_is_known_brings_the_unbiased_energy_back() -> None:
     stage, state = begun_at(prior, frames, detections)
     assert _gradient_error(stage, state, stage.problem.term_names).max() < 1e-4
     assert (left_of(stage).pixels.bias_px == 2).all()
+
+
+def test_a_stage_follows_a_wider_contour_wherever_it_stands() -> None:
+    """Two stages of one width are not the same stage: the first has nothing before it."""
+    prior, scene = cached_street()
+    widths = replace(DEFAULT, stages=tuple(StageConfig(contour_width_px=width) for width in (0.5, 2.0, 0.5)))
+    problem, state = DirectShapeRefiner(prior, widths).problem(scene.frames, scene.detections)
+    sight = problem.look(state)
+    assert [problem.begin(number, sight).after_wider for number in (0, 1, 2, -1)] == [False, False, True, True]

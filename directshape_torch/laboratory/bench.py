@@ -110,7 +110,7 @@ class Bench:
             problem = problem_of_scene(c, prior, frame, detections, cars, seen, own_terms)
             if isinstance(drawn.state, TrackState):
                 problem = _of_a_track(problem, cars, drawn.state.alone)
-            stages.append(problem.begin(c.stages[regime.stage], problem.look(start)))
+            stages.append(problem.begin(regime.stage, problem.look(start)))
         if own_terms:
             _check_refused(config, prior, scene, detections, cars, seen, own_terms)
         terms = _named(*stages)

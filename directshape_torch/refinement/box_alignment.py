@@ -109,7 +109,7 @@ def moved_costs(
 def _begun(problem: CarProblem, state: CarState, cars: CarBatch) -> tuple[Photometric, Surface]:
     """The photometric term with the pixels of the near sides, and these sides."""
     sight = problem.look(state)._replace(hits=_near_sides(problem, state, cars))
-    term = problem.begin(problem.stages()[-1], sight).photometric
+    term = problem.begin(-1, sight).photometric
     assert term is not None, "the problem of the method has this term alone"
     return term, term.where(sight)
 

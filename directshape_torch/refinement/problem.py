@@ -87,13 +87,13 @@ class CarProblem:
             views = marched_views(*self.rays, bounds, num_samples, field, state.T_obj_cam)
         return Sight(state, field_of(self.prior.bind(state.code)) if torch.is_grad_enabled() else field, *views)
 
-    def begin(self, stage: StageConfig, sight: Sight) -> CarStage:
-        """The stage with everything fixed at a state that must not change while costs are compared."""
+    def begin(self, stage: int, sight: Sight) -> CarStage:
+        """The stage of that number, with everything fixed at a state that must not change while costs are compared."""
         stages = self.stages()
-        earlier = stages[: stages.index(stage)] if stage in stages else []
-        after_wider = any(other.contour_width_px > stage.contour_width_px for other in earlier)
-        terms = tuple(each.begin(stage, sight) for each in (*self.evidence, *self.extra_terms))
-        return CarStage(self, stage, terms, after_wider, sight.state.unknowns)
+        config, earlier = stages[stage], stages[: range(len(stages))[stage]]
+        after_wider = any(other.contour_width_px > config.contour_width_px for other in earlier)
+        terms = tuple(each.begin(config, sight) for each in (*self.evidence, *self.extra_terms))
+        return CarStage(self, config, terms, after_wider, sight.state.unknowns)
 
     def of_problems(self, keep: Tensor) -> CarProblem:
         """The problem of the cars where `keep` (B,) holds."""

@@ -66,7 +66,7 @@ def unrolled_state(
     if any(part.requires_grad for part in start):
         _warn_of_lost_starts((rows if names is None else names)[~led_here].tolist())
     state = where_rows(led_here, start, _first_states(trajectory, repeated))
-    stages, begun, stage = problem.stages(), -1, None
+    begun, stage = -1, None
     for iteration, taken in zip(trajectory, repeated, strict=True):
         if not bool(taken.any()):
             continue
@@ -75,7 +75,7 @@ def unrolled_state(
             began = take_rows(minimum.stage_starts[begun], rows)
             # Where the repeated steps have led to it, the state at which a stage begins is a function too.
             began = where_rows(led_here, _with_values(began, state), began)
-            stage = problem.begin(stages[begun], problem.look(began))
+            stage = problem.begin(begun, problem.look(began))
         state = where_rows(taken, _step(problem, stage, state, iteration), state)
         led_here = led_here | taken
     return _with_values(take_rows(minimum.state, rows), state)
@@ -131,7 +131,7 @@ def implicit_state(
     state = take_rows(minimum.state, rows)
     with torch.no_grad():
         seen = problem.look(take_rows(minimum.stage_starts[-1], rows))
-    stage = problem.begin(problem.stages()[-1], seen)
+    stage = problem.begin(-1, seen)
     free = stage.free_unknowns(state)
     delta = torch.zeros(free.shape, dtype=torch.float64, device=free.device)
     at, J = _gradient_and_its_jacobian(stage, state, delta, exact)

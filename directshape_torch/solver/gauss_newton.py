@@ -140,8 +140,8 @@ def minimise(
         history: list[Tensor] = []
         starts: list[StateT] = []
         trajectory: list[Iteration[StateT]] | None = [] if record else None
-        for config_of_stage in problem.stages():
-            stage = problem.begin(config_of_stage, seen)
+        for number, config_of_stage in enumerate(problem.stages()):
+            stage = problem.begin(number, seen)
             starts.append(state)
             log = _Log(history, trajectory, len(starts) - 1, state, config_of_stage.over_relaxation)
             state, ended, done, unfailed = _run_stage(stage, config_of_stage, state, seen, ended, unfailed, config, log)

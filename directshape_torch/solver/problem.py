@@ -116,8 +116,8 @@ class Problem(Protocol[StateT]):
         """What everything that is asked of a state begins with."""
         ...
 
-    def begin(self, stage: StageConfig, seen: Any) -> BegunStage[StateT]:
-        """A stage that begins at a state that was looked at."""
+    def begin(self, stage: int, seen: Any) -> BegunStage[StateT]:
+        """The stage of that number, which begins at a state that was looked at; -1 is the last one."""
         ...
 
     def of_problems(self, keep: Tensor) -> Problem[StateT]:

@@ -126,7 +126,7 @@ def residual_maps(
         for state in states:
             T_cam_obj, code = (torch.from_numpy(np.asarray(x)).to(start.code) for x in state)
             sight = problem.look(start._replace(T_obj_cam=se3.inverse(T_cam_obj), code=code))
-            found.append(car_residuals(problem.begin(config.stages[-1], sight), pixels, sight))
+            found.append(car_residuals(problem.begin(-1, sight), pixels, sight))
     return found
 
 

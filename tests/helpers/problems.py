@@ -54,7 +54,7 @@ def begun_stage(
 ) -> tuple[CarStage, CarState]:
     """A stage of the problem of these cars that has begun at the input state, and that state."""
     problem, state = DirectShapeRefiner(prior, config).problem(frames, detections)
-    return problem.begin(problem.stages()[stage], problem.look(state)), state
+    return problem.begin(stage, problem.look(state)), state
 
 
 def figures_at(stage: CarStage, state: CarState) -> Figures:

@@ -53,8 +53,8 @@ class VectorProblem:
     def look(self, state: Vector) -> Vector:
         return state
 
-    def begin(self, stage: StageConfig, seen: Vector) -> Self:
-        self.begun.append(stage)
+    def begin(self, stage: int, seen: Vector) -> Self:
+        self.begun.append(self.stage_configs[stage])
         return self
 
     def figures(self, seen: Vector) -> Energy:

@@ -32,9 +32,9 @@ class Curved(VectorProblem):
         super().__init__(stages, num_unknowns=2, limit=1.0)
         self.theta, self.bound, self.scale = theta, bound, 1.0
 
-    def begin(self, stage: StageConfig, seen: Vector) -> Curved:
+    def begin(self, stage: int, seen: Vector) -> Curved:
         begun = Curved(self.theta, self.stage_configs, self.bound)
-        begun.scale = stage.contour_width_px
+        begun.scale = self.stage_configs[stage].contour_width_px
         return begun
 
     def residual(self, x: Tensor, theta: Tensor) -> Tensor:

@@ -58,7 +58,7 @@ def test_an_offset_does_what_a_constant_field_does(level: int) -> None:
             ellipsoid_prior(), frames, _unsure(disturbed(scene.detections, 0.05, 0.02)), DEFAULT, 1 - level
         )
         state = state._replace(offset_px=torch.full_like(state.offset_px, offset_px))
-        stage = stage.problem.begin(stage.config, stage.problem.look(state))
+        stage = stage.problem.begin(1 - level, stage.problem.look(state))
         term, sight = photometric_of(stage), stage.problem.look(state)
         at = term.linear(sight.field, state, term.where(sight))
         again = term.residual(sight.field, state, at.where)

@@ -73,7 +73,7 @@ def test_cost_is_the_mean_norm_of_the_distances() -> None:
         frames, SCENE.detections
     )
     sight = problem.look(state)
-    cost = problem.begin(problem.stages()[0], sight).figures(sight).term_costs[0, -1]
+    cost = problem.begin(0, sight).figures(sight).term_costs[0, -1]
     points = seen(0) @ state.T_obj_cam[0, :3, :3].T + state.T_obj_cam[0, :3, 3]
     sdf = PRIOR.bind(state.code).value(points, torch.zeros(len(points), dtype=torch.long)).abs()
     norm = torch.where(sdf < 0.2, sdf**2 / 2, 0.2 * (sdf - 0.1))

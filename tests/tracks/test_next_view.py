@@ -62,7 +62,7 @@ def at_truth(
 
 def begun(problem: CarProblem, state: TrackState, stage: int = 1) -> tuple[NextView, Sight]:
     sight = problem.look(state)
-    (term,) = problem.begin(problem.stages()[stage], sight).terms
+    (term,) = problem.begin(stage, sight).terms
     assert isinstance(term, NextView)
     return term, sight
 
@@ -214,7 +214,7 @@ def test_what_images_change_is_differentiable(brightness: Brightness) -> None:
         with torch.no_grad():
             sight = problem.look(state)
         # The state at which a stage begins is a constant.
-        stage = problem.begin(problem.stages()[1], sight)
+        stage = problem.begin(1, sight)
         return stage.linearise_differentiably(disturbed(state)).gradient.square().sum()
 
     by = torch.zeros((), dtype=torch.float64, requires_grad=True)

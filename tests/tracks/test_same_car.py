@@ -113,7 +113,7 @@ def unlike(change: str | None = None) -> Tensor:
     views = TrackState.of(state)._replace(T_obj_next=state.T_obj_cam[NEXT][:, None])
     problem = replace(problem, evidence=(evidence,))
     sight = problem.look(views)
-    (begun,) = problem.begin(problem.stages()[-1], sight).terms
+    (begun,) = problem.begin(-1, sight).terms
     assert isinstance(begun, NextView)
     return unlikeness(begun, is_cut_off(stereo), sight, NEXT)
 
