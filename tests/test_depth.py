@@ -7,6 +7,7 @@ from helpers.ellipsoids import Ellipsoid
 
 from directshape_torch.rows import Rays
 from directshape_torch.shape.field import PackedField
+from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.terms.depth import Hits, tracked_depth
 
 RADIUS_M = 1.5
@@ -55,3 +56,18 @@ def test_a_plane_along_the_ray_is_no_guide() -> None:
     hits = Hits(points, sideways, torch.ones(1, 64, dtype=torch.bool), in_objects.depth_next_to(points))
     depth = tracked_depth(FIELD, rays, in_objects, hits)
     assert (depth - in_objects.depth_next_to(points)).abs().max() < 1.0
+
+
+def test_a_surface_beside_a_face_where_its_slope_jumps_is_reached() -> None:
+    """Tracked on and on, from a point behind the face, whose slope leads to a point in front of it and back again."""
+    behind = 0.1 * torch.arange(-5, 6, dtype=torch.float64)  # metres behind the face, of the nodes along z
+    values = -1.6e-5 - torch.where(behind > 0, 0.16, 0.75) * behind
+    shape = values.expand(1, 3, 3, -1).contiguous()
+    field = GridShape(shape, torch.zeros(3, 3, 11, 1).double(), torch.tensor([-0.1, -0.1, -0.5]).double(), 0.1).field
+    rays = Rays(OWNER, torch.zeros(1, 3).double(), torch.tensor([0.0, 0.0, 1.0]).double().view(3, 1, 1))
+    in_objects, depth = rays.in_objects(_pose((0.0, 0.0, 0.0))), torch.full((1, 1), 10.00026).double()
+    for _ in range(6):
+        points = in_objects.at(depth)
+        hits = Hits(points, field.gradient(points, OWNER), torch.ones(1, 1, dtype=torch.bool), depth)
+        depth = tracked_depth(field, rays, in_objects, hits)
+    assert abs(float(depth) - (10 - 1.6e-5 / 0.75)) < 1e-12

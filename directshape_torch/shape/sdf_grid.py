@@ -28,8 +28,9 @@ from directshape_torch.shape.shape_prior import SdfDerivatives
 
 # Beside any distance nothing, and a normal number in single precision.
 _TINY = 2e-38
-# A start so near to the face in front of it, in cells, begins behind it: where a search has ended on a face, rounding
-# does not choose the cell in which the next one begins.
+# A start so near to the face in front of it along the ray, in cells, begins behind it: where a search has ended on a
+# face, rounding does not choose the cell in which the next one begins, and beside a second face that cell is still one
+# of those that the ray comes through.
 _ON_FACE = 1e-4
 _NO_STEP = 1e-12
 # Beside a slope of a thousandth, this one below a fraction bar is beyond all grids.
@@ -167,7 +168,7 @@ class GridField(NamedTuple):
         then waits on the face that it came to, and goes on from there when the ray is tracked next. A ray whose `near`
         is its `far` stays there.
         """
-        step, node, place = _cells_along(self, owner, centre_obj, direction_obj, depth)
+        step, node, place = _cells_along(self, owner, centre_obj, direction_obj, depth, _ON_FACE)
         along = _derivatives_along(self, node, place, step)
         # From here on a ray is seen the way the distance falls from where it begins, by how far it has come. There is
         # no choice between two values by a condition in what follows: on a processor one costs as much as ten sums.
@@ -201,7 +202,8 @@ class GridField(NamedTuple):
         return RayMinimum(torch.addcmul(depth, sign, come), face * (is_kink | running).to(depth.dtype))
 
     def curvature_along(self, owner: Tensor, centre_obj: Tensor, direction_obj: Tensor, depth: Tensor) -> Tensor:
-        step, node, place = _cells_along(self, owner, centre_obj, direction_obj, depth)
+        # In the very cell that a lookup at that depth takes, however near its faces are.
+        step, node, place = _cells_along(self, owner, centre_obj, direction_obj, depth, 0.0)
         return 2 * _derivatives_along(self, node, place, step).second
 
 
@@ -327,13 +329,16 @@ def _summed(table: Tensor, corners: Tensor, fraction: Tensor) -> Tensor:
 
 
 def _cells_along(
-    field: GridField, owner: Tensor, centre_obj: Tensor, direction_obj: Tensor, depth: Tensor
+    field: GridField, owner: Tensor, centre_obj: Tensor, direction_obj: Tensor, depth: Tensor, ahead: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Cells per metre of depth (3, M, R), lower node (M, R) of the cell at a depth, and the place (3, M, R) in it."""
+    """Cells per metre of depth (3, M, R), lower node (M, R) of the cell at a depth, and the place (3, M, R) in it.
+
+    A face that is no further than `ahead`, in cells, in front of the place along the ray is behind it.
+    """
     step = direction_obj * (1 / field.spacing_m)
     step = torch.copysign(step.abs().clamp_min(_NO_STEP), step)
     position = torch.addcmul(field.positions(centre_obj), depth, step)
-    lower = (position + _ON_FACE).floor().clamp_min(0).minimum(field.last_nodes(position) - 1)
+    lower = torch.add(position, step.sign(), alpha=ahead).floor().clamp_min(0).minimum(field.last_nodes(position) - 1)
     return step, field.nodes_of(field.lower_nodes(lower), owner), position - lower
 
 

@@ -272,10 +272,12 @@ def tracked_depth(field: Field, rays: Rays, in_objects: ObjectRays, before: Hits
 
 def _secant_slope(step: Tensor, sdf_before: Tensor, sdf: Tensor, slope: Tensor) -> Tensor:
     """Slope along the ray (M, R) between the last two points; the one at hand where they tell none."""
-    far_enough = step.abs() > _LEAST_STEP_M
-    secant = (sdf - sdf_before) / torch.where(far_enough, step, torch.ones_like(step))
+    # On both sides of the surface points tell it however near they are. Where the slope jumps there, at the face of a
+    # cell, the one at hand would lead back to the point before, again and again.
+    tells = (step.abs() > _LEAST_STEP_M) | (sdf * sdf_before < 0)
+    secant = (sdf - sdf_before) / torch.where(tells, step, torch.ones_like(step))
     # Entering, and not so flat that the next step would be a leap.
-    return torch.where(far_enough & (secant < _FLATTEST_SHARE * slope) & (slope < 0), secant, slope)
+    return torch.where(tells & (secant < _FLATTEST_SHARE * slope) & (slope < 0), secant, slope)
 
 
 def surface_depth(field: Field, owner: Tensor, rays: ObjectRays, depth: Tensor, usable: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 from directshape_torch.geometry import se3
 from directshape_torch.rows import ObjectRays, Rays
 from directshape_torch.shape.field import Field, PackedField, field_of
-from directshape_torch.shape.sdf_grid import RayMinimum, _AlongRay, _first_root
+from directshape_torch.shape.sdf_grid import GridField, GridShape, RayMinimum, _AlongRay, _first_root
 from directshape_torch.shape.shape_prior import BoundShape
 from directshape_torch.terms.depth import (
     Bracket,
@@ -262,3 +262,33 @@ def test_the_best_depth_is_the_one_of_least_distance() -> None:
     near = bracket.depth
     bracket = bracket.probed(torch.tensor([-0.01])).probed(torch.tensor([0.3]))
     assert torch.equal(bracket.best, near)
+
+
+def _grid(values: Tensor) -> GridField:
+    """Of distances (nx, ny) at nodes 0.1 m apart, alike for all z."""
+    nodes = values.double()[None, ..., None].expand(1, *values.shape, 3).contiguous()
+    return GridShape(nodes, torch.zeros(*values.shape, 3, 1).double(), torch.zeros(3).double(), 0.1).field
+
+
+def test_a_search_ends_where_it_began_beside_another_face() -> None:
+    """The least distance lies on x = 0.4, where y is 5 micrometres short of 0.4: no search moves away from there."""
+    x, y = torch.arange(-4.0, 5.0)[:, None], torch.arange(-4.0, 5.0)
+    field = _grid(torch.where(x > 0, 0.002 * x, -0.0256 * x) + 0.03 * y.clamp_min(0))
+    direction = torch.tensor([-0.975, 0.103, 0.0]).double().view(3, 1, 1)
+    centre = torch.tensor([0.4, 0.4 - 5e-6, 0.1]).double().view(3, 1, 1) - direction
+    for begins in (1.0, 1.0 + 5e-6 / 0.103):
+        ends = [torch.full((1, 1), end).double() for end in (begins, 0.7, 1.3)]
+        found = field.minimum_along(OWNER, centre, direction, *ends, 2)
+        assert abs(float(found.depth) - 1) < 1e-7
+        assert found.face_obj.flatten().tolist() == [1, 0, 0]
+
+
+def test_curvature_is_that_of_the_cell_in_which_the_point_lies() -> None:
+    """Of one raised node: `x y` in the cell before the face, `(1 - x) y` behind it."""
+    raised = torch.zeros(5, 5)
+    raised[2, 2] = 1.0
+    direction = torch.tensor([1.0, 1.0, 0.0]).double().view(3, 1, 1)
+    centre = torch.tensor([0.2, 0.15, 0.1]).double().view(3, 1, 1) - direction
+    for depth, expected in ((1 - 5e-6, 200.0), (1 + 5e-6, -200.0)):
+        curvature = _grid(raised).curvature_along(OWNER, centre, direction, torch.full((1, 1), depth).double())
+        assert abs(float(curvature) - expected) < 1e-9
