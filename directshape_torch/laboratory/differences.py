@@ -2,9 +2,9 @@
 
 A function is sampled at `+-h` for a geometric sequence of steps h. Three neighbouring steps make one stencil, whose
 extrapolation removes the errors of order h^2 and h^4. Which stencil serves an entry is decided before any comparison,
-by values of the function alone: its rounding noise (measured), the error that the extrapolation estimates of itself,
-and the jump of the slope between both sides of the centre, extrapolated likewise, which is zero unless a kink lies
-within the stencil.
+by values of the function alone: its rounding noise (measured), how far the derivatives from its two larger and its two
+smaller steps are apart, the jump of the slope between both sides of the centre, extrapolated likewise, which is zero
+unless a kink lies within the stencil, and what finer stencils say.
 """
 
 from __future__ import annotations
@@ -92,7 +92,8 @@ def _extrapolate(centre: Tensor, plus: Tensor, minus: Tensor, noise: Tensor, uni
     _, extrapolated_jump = _two_orders(jump, (1, 3))
     rounding = 2 * noise[:, None] / step[2:]
     kink = (extrapolated_jump.abs() - _JUMP_ROUNDING * noise[:, None] / step[2:]).clamp_min(0)
-    return DifferenceSweep(second, (second - first[1:]).abs() + kink + rounding, rounding)
+    # Of a smooth function the second order is better than that by far; of one with kinks it is not.
+    return DifferenceSweep(second, (first[1:] - first[:-1]).abs() + kink + rounding, rounding)
 
 
 def _two_orders(values: Tensor, orders: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -110,7 +111,11 @@ class Choice(NamedTuple):
 
 
 def choose(found: DifferenceSweep, needed: Tensor) -> Choice:
-    """Take for each entry the stencil of least estimated error.
+    """Take for each entry the stencil of least estimated error that no finer one contradicts.
+
+    A derivative is a limit of small steps: where the errors that a stencil and a finer one estimate of themselves do
+    not explain their difference, the coarser one has a kink within it, on both sides perhaps, that its own values do
+    not show.
 
     Args:
         found: the sweep.
@@ -125,7 +130,7 @@ def choose(found: DifferenceSweep, needed: Tensor) -> Choice:
         >>> choose(found, torch.full((1,), 1e-6, dtype=torch.float64)).excluded[KINK]
         tensor([[True]])
     """
-    ranking = found.error + _CAUTION * found.rounding
+    ranking = (found.error + _CAUTION * found.rounding).masked_fill(_contradicted(found), torch.inf)
     best = ranking.argmin(dim=0, keepdim=True)  # that of NaN, if there is one
     derivative, error = (x.gather(0, best)[0] for x in (found.extrapolated, found.error))
     needed = needed[:, None]
@@ -133,3 +138,11 @@ def choose(found: DifferenceSweep, needed: Tensor) -> Choice:
     kink = ~unresolved & (error > needed)
     excluded = unresolved | kink
     return Choice(torch.where(excluded, torch.nan, derivative), {KINK: kink, UNRESOLVED: unresolved})
+
+
+def _contradicted(found: DifferenceSweep) -> Tensor:
+    """Which stencils (S - 2, R, D) are further from a finer one than both errors allow; of no number none is."""
+    low, high = found.extrapolated - found.error, found.extrapolated + found.error
+    least_high = high.flip(0).cummin(dim=0).values.flip(0)
+    largest_low = low.flip(0).cummax(dim=0).values.flip(0)
+    return (low > least_high) | (high < largest_low)

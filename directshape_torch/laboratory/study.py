@@ -163,8 +163,10 @@ def _worst_table(comparisons: Sequence[Comparison]) -> str:
         own = [c for c in comparisons if c.name == name]
         errors = [f"{max(c.errors[pair] for c in own):.1e}" for pair in BOUNDS]
         worst = max(own, key=lambda c: c.errors["analytic-numeric"]).regime
-        rows.append([name, sum(c.compared for c in own), *errors, worst])
-    return _table(["subject", "entries", *BOUNDS, "worst regime (numeric)"], rows)
+        excluded = sum(sum(c.excluded.values()) for c in own)
+        share = f"{excluded} ({100 * excluded / max(1, sum(c.entries for c in own)):.2f} %)"
+        rows.append([name, sum(c.compared for c in own), share, *errors, worst])
+    return _table(["subject", "compared", "excluded", *BOUNDS, "worst regime (numeric)"], rows)
 
 
 def _exclusion_table(comparisons: Sequence[Comparison]) -> str:

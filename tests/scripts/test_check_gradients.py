@@ -27,6 +27,8 @@ def test_tables_and_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert script.main([*_QUICK, "--term", "shape", "height", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
     assert "far_80m" in printed
+    assert "| subject | compared | excluded |" in printed
+    assert re.search(r"\| shape \| \d+ \| 0 \(0\.00 %\) \|", printed)
     assert "**All bounds hold.**" in printed
     assert {p.name for p in tmp_path.iterdir()} == {"summary.md", "jacobians.csv"}
     assert (tmp_path / "summary.md").read_text() == printed
