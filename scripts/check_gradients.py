@@ -86,7 +86,9 @@ def run(args: argparse.Namespace) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line and run; 0: all bounds hold, 1: one is broken, 2: wrong use."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--states", type=int, default=3, metavar="N", help="states in each regime (default 3)")
+    parser.add_argument(
+        "--states", type=int, default=8, metavar="N", help="states in each regime (default 8: a minute)"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="for jacobians.csv and summary.md")
     parser.add_argument("--term", nargs="+", metavar="NAME", help="default all; module:factory for one of your own")
     parser.add_argument("--regime", nargs="+", metavar="NAME", help="default all")

@@ -9,6 +9,7 @@ unless a kink lies within the stencil, and what finer stencils say.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -28,6 +29,8 @@ UNRESOLVED = "below float64 resolution"
 _JITTER = 1e-11
 # With few of them the largest is at times far below the rounding there is, and a stencil too fine is taken.
 _NUM_JITTERS = 16
+# Displacements evaluated in one batch.
+_AT_ONCE = 14
 # Rounding of the extrapolated jump, in roundings of the values over the smallest step: (2 * 256 + 2 * 68 + 2) / 189,
 # and the centre's.
 _JUMP_ROUNDING = 7.0
@@ -35,7 +38,7 @@ _JUMP_ROUNDING = 7.0
 _CAUTION = 10.0
 
 Evaluate = Callable[[Tensor], Sequence[Tensor]]
-"""Several functions (R,) of one displacement (D,), evaluated together because they share work."""
+"""Several functions (R,) of one displacement (D,), evaluated together because they share work; by `torch.vmap`."""
 
 
 @dataclass(frozen=True)
@@ -59,29 +62,24 @@ def sweep(evaluate: Evaluate, units: Tensor) -> list[DifferenceSweep]:
         >>> bool(abs(found.extrapolated[2, 0, 0] - torch.cos(torch.tensor(1.0, dtype=torch.float64))) < 1e-10)
         True
     """
-    centre = evaluate(torch.zeros_like(units))
-    noise = _noise(evaluate, centre, units)
-    # (S, D) pairs of ends, for each function.
-    moves = torch.diag(units)
-    ends = [[(evaluate(step * move), evaluate(-step * move)) for move in moves] for step in STEPS]
-    sweeps = []
-    for j, middle in enumerate(centre):
-        plus, minus = (
-            torch.stack([torch.stack([pair[side][j] for pair in row], dim=-1) for row in ends]) for side in (0, 1)
-        )
-        sweeps.append(_extrapolate(middle, plus, minus, noise[j], units))
-    return sweeps
-
-
-def _noise(evaluate: Evaluate, centre: Sequence[Tensor], units: Tensor) -> list[Tensor]:
     generator = torch.Generator().manual_seed(0)
-    noise = [torch.finfo(units.dtype).eps * value.abs() for value in centre]
-    for _ in range(_NUM_JITTERS):
-        direction = torch.rand(len(units), generator=generator, dtype=torch.float64).to(units) * 2 - 1
-        ends = [evaluate(sign * _JITTER * units * direction) for sign in (1, -1)]
-        for j, (plus, minus) in enumerate(zip(*ends, strict=True)):
-            noise[j] = torch.maximum(noise[j], 0.5 * (plus + minus - 2 * centre[j]).abs())
-    return noise
+    jitters = torch.rand(_NUM_JITTERS, len(units), generator=generator, dtype=torch.float64).to(units) * 2 - 1
+    moves = units.new_tensor(STEPS)[:, None, None] * torch.diag(units)
+    deltas = torch.cat([torch.zeros_like(units)[None], _JITTER * units * jitters, moves.flatten(0, 1)])
+    with warnings.catch_warnings():
+        # An operation that knows of no batch runs one displacement after the other, which is all that is said.
+        warnings.filterwarnings("ignore", message=".*performance drop.*")
+        plus, minus = (torch.func.vmap(evaluate, chunk_size=_AT_ONCE)(sign * deltas) for sign in (1, -1))
+    return [_of_one_function(*ends, units) for ends in zip(plus, minus, strict=True)]
+
+
+def _of_one_function(plus: Tensor, minus: Tensor, units: Tensor) -> DifferenceSweep:
+    """From values (1 + `_NUM_JITTERS` + S D, R) at displacements and at their negatives: none, jitters, steps."""
+    centre, jittered = plus[0], slice(1, 1 + _NUM_JITTERS)
+    unsteady = 0.5 * (plus[jittered] + minus[jittered] - 2 * centre).abs().amax(dim=0)
+    noise = torch.maximum(torch.finfo(units.dtype).eps * centre.abs(), unsteady)
+    plus, minus = (x[jittered.stop :].view(len(STEPS), len(units), -1).mT for x in (plus, minus))
+    return _extrapolate(centre, plus, minus, noise, units)
 
 
 def _extrapolate(centre: Tensor, plus: Tensor, minus: Tensor, noise: Tensor, units: Tensor) -> DifferenceSweep:

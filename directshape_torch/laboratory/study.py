@@ -32,7 +32,7 @@ class StudyPlan:
     subjects: tuple[str, ...] = SUBJECT_NAMES  # terms by name
     own_terms: tuple[TermFactory, ...] = ()  # make further terms, which are examined as the others
     regimes: tuple[Regime, ...] = field(default_factory=lambda: tuple(regimes_named(None)))  # by name
-    num_states: int = 3  # per regime
+    num_states: int = 8  # per regime
     seed: int = 0  # of the draws
     pixels_per_car: int = 24  # at most, on each side
     second: bool = True  # examine the derivatives of the terms' gradients too
