@@ -338,7 +338,7 @@ def _cells_along(
     step = direction_obj * (1 / field.spacing_m)
     step = torch.copysign(step.abs().clamp_min(_NO_STEP), step)
     position = torch.addcmul(field.positions(centre_obj), depth, step)
-    lower = torch.add(position, step.sign(), alpha=ahead).floor().clamp_min(0).minimum(field.last_nodes(position) - 1)
+    lower = (position + ahead * step.sign()).floor().clamp_min(0).minimum(field.last_nodes(position) - 1)
     return step, field.nodes_of(field.lower_nodes(lower), owner), position - lower
 
 
