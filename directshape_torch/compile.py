@@ -57,14 +57,13 @@ class _Process:
     """What this process has done so far."""
 
     lock: threading.RLock = field(default_factory=threading.RLock)
-    cars: int = 0
     forms: int = 0
     said_why_not: bool = False
     forked: bool = False
 
 
 _process = _Process()
-_job: ContextVar[int | None] = ContextVar("directshape_torch_job", default=None)
+_job: ContextVar[int] = ContextVar("directshape_torch_job", default=0)
 _mode: ContextVar[CompileMode] = ContextVar("directshape_torch_compiling", default="off")
 
 
@@ -78,30 +77,26 @@ if hasattr(os, "register_at_fork"):
 
 
 @contextmanager
-def compiling(mode: CompileMode, num_cars: int) -> Iterator[None]:
-    """Region in which marked functions may be compiled, for the refinement of some cars.
+def compiling(mode: CompileMode) -> Iterator[None]:
+    """Region in which marked functions may be compiled.
 
-    "on" compiles always, "off" never, and "auto" where the job has at least `CARS_WORTH_COMPILING` cars: those that
-    `cars_ahead` tells of, or else those of the process so far. Without a working compiler "auto" stays plain and says
-    so once in the log. Forked processes stay plain. Inference mode becomes `no_grad` inside: its tensors would be one
-    more compilation of everything.
+    "on" compiles always, "off" never, and "auto" where `cars_ahead` has told of a job of at least
+    `CARS_WORTH_COMPILING` cars. Without a working compiler "auto" stays plain and says so once in the log. Forked
+    processes stay plain. Inference mode becomes `no_grad` inside: its tensors would be one more compilation of
+    everything.
 
     Args:
         mode: the setting.
-        num_cars: of this call.
 
     Raises:
         CompilationError: in mode "on" where there is no working C++ compiler.
 
     Examples:
-        >>> with compiling("auto", num_cars=1):
-        ...     will_compile(torch.ones(2))  # one car is not worth it
+        >>> with compiling("auto"):
+        ...     will_compile(torch.ones(2))  # nobody has told of a job that is worth it
         False
     """
-    with _process.lock:
-        _process.cars += num_cars if mode != "off" else 0
-    job = _job.get()
-    is_worth_it = mode == "on" or (mode == "auto" and (_process.cars if job is None else job) >= CARS_WORTH_COMPILING)
+    is_worth_it = mode == "on" or (mode == "auto" and _job.get() >= CARS_WORTH_COMPILING)
     token = _mode.set(mode if is_worth_it and not _process.forked and _can_compile(mode) else "off")
     gradients = torch.is_grad_enabled()
     try:

@@ -361,8 +361,8 @@ class RefinerConfig(Settings):
     )
     compile: Literal["auto", "on", "off"] = setting(
         "auto",
-        'compile the hot functions: "on", "off", or "auto" (where there is a C++ compiler and the job, or the process '
-        'so far, has at least 3000 cars). Compiled results differ in the last digits: "on" or "off" repeats them '
+        'compile the hot functions: "on", "off", or "auto" (where there is a C++ compiler and the command refine has '
+        'a job of at least 3000 cars). Compiled results differ in the last digits: "on" or "off" repeats them '
         "to the bit",
     )
     check: Literal["first", "always", "off"] = setting(

@@ -142,7 +142,7 @@ class DirectShapeRefiner(nn.Module):
         with (
             torch.set_grad_enabled(differentiate),
             full_precision(),
-            compiling(self.config.compile, len(detections)),
+            compiling(self.config.compile),
         ):
             result = self._refine(frames, detections, term_weights, noise)
             return result if noise is None else fused(result, detections)

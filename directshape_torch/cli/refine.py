@@ -29,10 +29,10 @@ from directshape_torch.cli.options import (
     make_refiner,
 )
 from directshape_torch.cli.progress import Bar, ProgressBar
-from directshape_torch.config import RefinerConfig
 from directshape_torch.data_check.check_dataset import check_frames
 from directshape_torch.errors import InputError
 from directshape_torch.files.atomic_files import write_png
+from directshape_torch.io.config_files import load_config
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.detector_noise import in_words
@@ -112,14 +112,17 @@ def run(args: argparse.Namespace) -> int:
     chosen = [] if args.method is None else [f"method={args.method}"]
     extra = [] if args.lidar is None else [LidarPoints()]
     exact = ["rig.disparity_sigma_px=0"] if args.rig == "none" else []
-    refiner = make_refiner(args.config, [*exact, *args.set, *chosen], args.prior, args.device, extra)
+    settings = [*exact, *args.set, *chosen]
+    # The data set is looked at below, so that calls need not look again.
+    refiner = make_refiner(args.config, [*settings, "check=off"], args.prior, args.device, extra)
     if args.disparity is not None and refiner.config.method in ("direct", "box_alignment"):
         raise InputError(
             "--disparity", "a method that uses it", refiner.config.method, "add --method geometric or combined"
         )
     dataset = dataset_of(args)
     check_out_dir(dataset, args.out)
-    refiner.config = _warned_of(dataset, refiner.config)
+    if load_config(args.config, settings).check != "off":
+        _warn_of(dataset)
     rigs, are_new = _rigs_of_run(dataset, args.rig, args.out, args.fresh)
     if rigs:
         dataset = replace(dataset, disparity_fields=tuple(rig.field for rig in rigs))
@@ -146,14 +149,12 @@ def run(args: argparse.Namespace) -> int:
     return summary.exit_code
 
 
-def _warned_of(dataset: StereoDataset, config: RefinerConfig) -> RefinerConfig:
-    """Print what the first frames show to be wrong; settings with which calls do not look again.
+def _warn_of(dataset: StereoDataset) -> None:
+    """Print what the first frames show to be wrong.
 
     Raises:
         InputError: their LiDAR points lie elsewhere, which would ruin cars that are right without them.
     """
-    if config.check == "off":
-        return config
     findings, _ = check_frames(dataset, dataset.frame_ids[:_CHECKED_FRAMES], match_images=False)
     for finding in by_severity(findings):
         # Which frame cannot be read, or has no cars, the run says itself, and goes on with the others.
@@ -162,7 +163,6 @@ def _warned_of(dataset: StereoDataset, config: RefinerConfig) -> RefinerConfig:
         if finding.check == "lidar_elsewhere" and finding.severity == "error":
             cure = f"{finding.cure}; or refine without --lidar, or with --set check=off"
             raise InputError("--lidar", f"scans that fit the images ({finding.expected})", finding.measured, cure)
-    return replace(config, check="off")
 
 
 def _rigs_of_run(dataset: StereoDataset, rig: str, out_dir: Path, fresh: bool) -> tuple[list[RigEstimate], bool]:

@@ -100,7 +100,7 @@ def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections
     rows = took_part.nonzero()[:, 0]
     everyone, inputs = refiner.problem(frames, detections)
     problem, initial = everyone.of_problems(took_part), CarState(*(x[rows] for x in inputs))
-    with full_precision(), compiling(refiner.config.compile, len(detections)):
+    with full_precision(), compiling(refiner.config.compile):
         minimum: Minimum[CarState] = minimise(problem, initial, refiner.config.solver, record=True)
         states = [initial, *_ends(minimum)]
         costs = torch.stack([minimum.stage.figures(problem.look(state)).term_costs for state in states])
