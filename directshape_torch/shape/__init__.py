@@ -1,1 +1,1 @@
-"""Shapes of cars as signed distance fields: grids, the PCA prior, ray casting, meshes and how priors are made."""
+"""This package describes shapes of cars by signed distance fields, and makes and stores priors of them."""

@@ -1,9 +1,9 @@
-"""Whether a shape looks like a car by the axes and unit that it is said to have, and which ones would make it a car.
+"""This module tells whether a shape looks like a car by its stated axes and unit, and else by which ones it would.
 
 Passenger cars of every type share a few traits. Left and right are mirror images of each other, as no other two sides
-are. A car is longer than wide and high. Seen from the front, the road shows between the wheels, and the roof closes the
-view above them. What lies above half the height has its centre behind the middle, or in it where a car is a pick-up. A
-shape is asked for these traits in each of its 24 turns.
+are. A car is longer than wide and high. Seen from the front, the road shows between the wheels, and the roof blocks the
+view above them. The part above half the height has its centre behind the middle of the length, or at the middle in
+pick-ups. A shape is checked for these traits in each of its 24 turns by right angles.
 """
 
 from __future__ import annotations
@@ -29,13 +29,14 @@ UNITS_M |= {"hundreds of metres": 100.0, "kilometres": 1000.0}
 
 # Real and parametric cars are 3.3 to 5.7 m long, 1.5 to 2.6 m wide and 1.0 to 2.2 m high.
 _LENGTHS_M, _WIDTHS_M, _HEIGHTS_M = (2.4, 6.2), (1.1, 2.8), (0.9, 2.5)
-# They have length to width of 1.7 to 3.1, height to width of 0.59 to 1.24 and length to height of 1.6 to 3.8.
+# Length to width of cars is 1.7 to 3.1, height to width is 0.59 to 1.24, and length to height is 1.6 to 3.8.
 _LENGTH_TO_WIDTH, _HEIGHT_TO_WIDTH, _LENGTH_TO_HEIGHT = (1.55, 3.3), (0.5, 1.4), (1.5, 4.3)
-# Real cars and their mirror images overlap by 0.98 and more, as other sides do by 0.88 at most.
+# A real car and its left-right mirror image overlap by 0.98 or more; mirrored at other sides by 0.88 at most.
 _LEAST_OVERLAP = 0.93
-# Cars have the centre at 0.36 to 0.47 of the length from the rear, pick-ups at 0.49 to 0.541.
+# Measured from the rear, the part above half the height has its centre at 0.36 to 0.47 of the length in most cars, and
+# at 0.49 to 0.541 in pick-ups.
 _FOREMOST_ROOF = 0.543
-# Of a view from the front: 1 for every real and parametric car.
+# A gap under the car of this size or more is clear; it is 1 for every real and parametric car.
 _CLEAR_GAP = 0.5
 _USUAL_LENGTH_M = 4.2
 _SMALLEST = 1e-300
@@ -43,15 +44,15 @@ _SMALLEST = 1e-300
 
 @dataclass(frozen=True)
 class Looks:
-    """The traits of a shape in one turn."""
+    """`Looks` holds the traits of a shape in one turn."""
 
     forward: str  # the shape's axes to the front and up, as "+x"
     up: str
     size_lwh: Array  # (3,) length, width, height in the units of the shape
-    overlap: float  # of the outlines with their left-right mirror images, 0 .. 1
+    overlap: float  # overlap of the outlines with their left-right mirror images, 0 .. 1
     gap_below: float  # how much more of the middle is open at the ground than at the roof, seen from the front, -1 .. 1
     is_upright: bool
-    roof: float  # centre of what lies above half the height: 0 at the rear, 1 at the front
+    roof: float  # centre of the part above half the height: 0 at the rear, 1 at the front
 
     @property
     def has_the_sizes_of_a_car(self) -> bool:
@@ -62,7 +63,7 @@ class Looks:
 
     @property
     def is_a_car(self) -> bool:
-        """Whether every trait but the size in metres is that of a car."""
+        """Whether every trait but the size in metres fits a car."""
         return (
             self.has_the_sizes_of_a_car
             and self.overlap >= _LEAST_OVERLAP
@@ -89,7 +90,7 @@ def all_looks(outlines: Outlines) -> list[Looks]:
 
 
 def turns_to_a_car(outlines: Outlines) -> list[Looks]:
-    """All turns in which a shape looks like a car; several of what looks alike from the front and the rear."""
+    """All turns in which a shape looks like a car; a shape that looks alike from front and rear has several."""
     return [looks for looks in all_looks(outlines) if looks.is_a_car]
 
 
@@ -107,19 +108,19 @@ def is_half_a_car(outlines: Outlines) -> bool:
 def check_looks(
     outlines: Outlines, forward: str, up: str, scale: float = 1.0, length_m: float | None = None, *, name: str
 ) -> None:
-    """Refuse a shape that does not look like a passenger car by what is said of its axes and unit.
+    """Refuse a shape that does not look like a passenger car by its stated axes and unit.
 
     Args:
-        outlines: of the shape, in its own axes and unit.
-        forward: its axis that is said to point to the front, as "+x".
-        up: its axis that is said to point upwards.
-        scale: metres that its unit is said to be.
-        length_m: the length that it will be scaled to; None keeps its own.
-        name: of the shape, for the message.
+        outlines: outlines of the shape, in its own axes and unit.
+        forward: stated axis of the shape that points to the front, as "+x".
+        up: stated axis of the shape that points upwards.
+        scale: stated length of the shape's unit, metres.
+        length_m: length to which the shape will be scaled; None keeps its own.
+        name: name of the shape, for the message.
 
     Raises:
-        UnlikelyMeshError: the sizes, the left-right symmetry, the wheels or the roof are not those of a car; the error
-            says by which axes and scale they would be.
+        UnlikelyMeshError: the sizes, the left-right symmetry, the wheels or the roof do not fit a car; the error says
+            by which axes and scale they would.
 
     Examples:
         >>> import trimesh
@@ -150,7 +151,7 @@ def check_looks(
 
 
 def _cure_of_size(size_lwh: Array, scale: float, length_m: float | None) -> tuple[dict[str, str | float], str]:
-    """Options that give a car of a size in its own unit the length of cars, and that unit in words."""
+    """Options that scale a car of this size, in its own unit, to the length of cars, and its unit in words."""
     low, high = _LENGTHS_M
     if low <= (size_lwh[0] * scale if length_m is None else length_m) <= high:
         return {}, ""
@@ -163,7 +164,7 @@ def _cure_of_size(size_lwh: Array, scale: float, length_m: float | None) -> tupl
 
 
 def _unit_of(size_lwh: Array) -> str | None:
-    """The unit in which these are length, width and height of a car, or None."""
+    """The unit in which these sizes are length, width and height of a car, or None."""
     bounds = np.array([_LENGTHS_M, _WIDTHS_M, _HEIGHTS_M])
     fitting = [
         name
@@ -174,7 +175,7 @@ def _unit_of(size_lwh: Array) -> str | None:
 
 
 def _no_car(outlines: Outlines, measured: str) -> UnlikelyMeshError:
-    """Why a shape looks like a car in no turn."""
+    """The error that says why a shape looks like a car in no turn."""
     if is_half_a_car(outlines):
         return UnlikelyMeshError(f"{measured}: it looks like half a car, cut along its middle; give all of it", {})
     overlaps = [looks.overlap for looks in all_looks(outlines) if looks.has_the_sizes_of_a_car]
@@ -186,7 +187,7 @@ def _no_car(outlines: Outlines, measured: str) -> UnlikelyMeshError:
 
 
 def posture(wanted: Looks, forward: str, up: str) -> str:
-    """How the car that a shape is in one turn stands where other axes are taken for its front and up."""
+    """The posture, in words, of a car with the axes of `wanted` where other axes are taken for its front and up."""
     if up[1] == wanted.up[1]:
         if up[0] != wanted.up[0]:
             return "upside down"
@@ -202,7 +203,10 @@ def _closed(mask: Mask, axis: int) -> Mask:
 
 
 def _overlap_with_mirror_image(mask: Mask) -> float:
-    """Intersection over union of a mask with itself, its rows reversed; a bar at one side may shift them by a few."""
+    """Intersection over union of a mask and its mirror image at the best shift by a few rows.
+
+    A bar at one side of a car shifts its mirror image.
+    """
     best, room = 0.0, max(len(mask) // 8, 1)
     for shift in range(-room, room + 1):
         image = np.zeros_like(mask)
@@ -233,6 +237,6 @@ def _third_axis(forward: str, up: str) -> str:
 
 
 def _roof_centre(profile: Mask) -> float:
-    """Where along the length the centre of what lies above half the height is, 0 .. 1."""
+    """Position along the length of the centre of the part above half the height, 0 .. 1."""
     filled = profile[:, profile.shape[1] // 2 :].sum(axis=1)
     return float((filled * (np.arange(len(filled)) + 0.5)).sum() / max(filled.sum(), 1) / len(filled))

@@ -1,4 +1,4 @@
-"""Whether an object can serve as a shape prior: asked once, when a refiner is made, and answered in words."""
+"""This module checks whether an object can serve as a shape prior, once, when a refiner is made."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ def check_prior(prior: ShapePrior, by_autograd: bool = False) -> None:
 
     Args:
         prior: any object that claims to be a `ShapePrior`.
-        by_autograd: the derivatives by autograd are needed too, not only those that the prior computes itself.
+        by_autograd: whether derivatives by autograd are needed too, besides the ones that the prior computes itself.
 
     Raises:
-        InputError: members are missing, derivatives have other shapes than their definitions say, are not finite, or
-            (by autograd) do not reach points or code, or come from inference mode.
+        InputError: members are missing, derivatives have a wrong shape or are not finite, or (by autograd) they do not
+            reach points or code, or the prior was made in inference mode.
 
     Examples:
         >>> from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -50,7 +50,7 @@ def _check_members(name: str, candidate: object, protocol: type) -> None:
 
 
 def _has(candidate: object, member: str) -> bool:
-    """The class first, because asking an object for a property computes it."""
+    """Whether a candidate has a member; its class is asked first, because an object would compute a property."""
     return hasattr(type(candidate), member) or hasattr(candidate, member)
 
 
@@ -81,7 +81,7 @@ def _check_attached(prior: ShapePrior) -> None:
         _check_reaches("value_and_derivatives: value", at.value, point, code)
         elsewhere = prior.bind(code + 1).value_and_derivatives(point + prior.spacing_m, index)
     for field in ("gradient", "J_value_code"):
-        # Derivatives that are the same everywhere, of a linear field, need no graph.
+        # The derivatives of a linear field are the same everywhere and need no graph.
         derivative, other = getattr(at, field), getattr(elsewhere, field)
         if not derivative.requires_grad and not torch.equal(derivative, other):
             _refuse_detached(f"value_and_derivatives: {field}", "points and code")

@@ -1,4 +1,4 @@
-"""Signed distances of all cars at points of blocks, coordinate first: what every term looks up."""
+"""Every term looks up the signed distances of all cars here, at points of blocks whose first axis is the coordinate."""
 
 from __future__ import annotations
 
@@ -12,30 +12,34 @@ from directshape_torch.numerics.tensors import length
 from directshape_torch.shape.sdf_grid import GridShape, Lookup, RayMinimum
 from directshape_torch.shape.shape_prior import BoundShape
 
-# Distance of the three samples that begin a search along a ray where nothing but values is known.
+# A search along a ray that knows only values begins with three samples at this distance from each other.
 _FIRST_SAMPLES_M = 0.06
-# Each round is so many times as fine as the one before.
+# Each round of the search samples this many times as finely as the round before.
 _FINER = 4.0
 _ROUNDS = 3
-# A vertex of a parabola further away, in distances of its samples, is a guess.
+# A parabola's vertex is a guess where it is more than this many sample distances away.
 _MAX_SAMPLE_DISTANCES = 1.5
-# Second difference of three samples below which it is rounding.
+# A second difference of three samples below this one is rounding.
 _LEAST_CURVATURE_M = 1e-6
 
 
 class Field(Protocol):
-    """Signed distances of B cars; points are (3, ..., M, R) and belong to the cars (M,) of their blocks."""
+    """A `Field` gives signed distances of B cars; points (3, ..., M, R) belong to the cars (M,) of their blocks."""
 
     def value(self, points_obj: Tensor, owner: Tensor, inside: bool = False) -> Tensor:
-        """Signed distance (..., M, R), metres; `inside`: no point that counts lies outside of the prior's bounds."""
+        """Signed distance (..., M, R), metres; `inside` says that the points that count are within the bounds."""
         ...
 
     def gradient(self, points_obj: Tensor, owner: Tensor) -> Tensor:
-        """Gradient (3, ..., M, R), a constant."""
+        """Gradient (3, ..., M, R) of the signed distance, as a constant."""
         ...
 
     def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False, inside: bool = False) -> Lookup:
-        """Value, gradient and code derivative; `constant`: nothing will be differentiated again; `inside` as above."""
+        """Value, gradient and code derivative of the signed distance.
+
+        `constant` says that they will not be differentiated again, `inside` that all points that count are within the
+        prior's bounds.
+        """
         ...
 
     def minimum_along(
@@ -43,21 +47,21 @@ class Field(Protocol):
         owner: Tensor,
         centre_obj: Tensor,  # (3, M, 1)
         direction_obj: Tensor,  # (3, M, R)
-        depth: Tensor,  # (M, R) to begin at
+        depth: Tensor,  # (M, R) where the search begins
         near: Tensor,  # (M, R)
         far: Tensor,  # (M, R)
         max_cells: int,
     ) -> RayMinimum:
-        """The least signed distance along rays, a constant."""
+        """The least signed distance along rays, as a constant."""
         ...
 
     def curvature_along(self, owner: Tensor, centre_obj: Tensor, direction_obj: Tensor, depth: Tensor) -> Tensor:
-        """Second derivative (M, R) of the signed distance by the depth, at depths (M, R), a constant."""
+        """Second derivative (M, R) of the signed distance by the depth, at depths (M, R), as a constant."""
         ...
 
 
 class PackedField(NamedTuple):
-    """The field of any shape that takes packed points."""
+    """`PackedField` is the field of any shape that takes packed points."""
 
     shape: BoundShape
 
@@ -86,13 +90,13 @@ class PackedField(NamedTuple):
         far: Tensor,
         max_cells: int,
     ) -> RayMinimum:
-        """By vertices of ever narrower parabolas: nothing but smoothness is known."""
+        """Find the minimum by vertices of ever narrower parabolas; the field need only be smooth."""
         value_at = self._along(owner, centre_obj, direction_obj)
         step = _FIRST_SAMPLES_M / length(direction_obj, dim=0)
         for _ in range(_ROUNDS):
             before, here, after = value_at(torch.stack([depth - step, depth, depth + step]))
             second, slope = before - 2 * here + after, 0.5 * (after - before)
-            # Where the field does not curve upwards the slope tells the side, and no more.
+            # Where the field does not curve upwards, the slope only tells on which side the minimum is.
             vertex = -slope / second.clamp_min(_LEAST_CURVATURE_M)
             depth = depth + vertex.clamp(-_MAX_SAMPLE_DISTANCES, _MAX_SAMPLE_DISTANCES) * step
             depth = torch.minimum(torch.maximum(depth, near), far)
@@ -107,12 +111,12 @@ class PackedField(NamedTuple):
         return curvature
 
     def _along(self, owner: Tensor, centre_obj: Tensor, direction_obj: Tensor) -> Callable[[Tensor], Tensor]:
-        """Signed distances (n, M, R) at depths (n, M, R) of rays."""
+        """A function that gives the signed distances (n, M, R) at depths (n, M, R) of rays."""
         return lambda depths: self.value(centre_obj[:, None] + depths * direction_obj[:, None], owner)
 
 
 def field_of(shape: BoundShape) -> Field:
-    """The field of a bound shape: that of its grids, where it looks up in them as a `GridShape` does."""
+    """The field of a bound shape: a `GridField` where the shape looks up in grids as a `GridShape` does."""
     looks_up = type(shape).value, type(shape).value_and_derivatives
     if isinstance(shape, GridShape) and looks_up == (GridShape.value, GridShape.value_and_derivatives):
         return shape.field

@@ -1,4 +1,4 @@
-"""Shape priors of any kind from a file or by name: the file itself says of which kind it is."""
+"""This module loads shape priors by name or from a file, which says of which kind its prior is."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BUNDLED_PRIORS: Mapping[str, Callable[[], ShapePrior]] = {
     "pca": PCAShapePrior.load_bundled,
     "neural": NeuralShapePrior.load_bundled,
 }
-"""The priors that come with the package, by the name that `load_prior` knows them by."""
+"""This maps the names that `load_prior` knows to functions that load the priors of the package."""
 
 _READERS: Mapping[str, Callable[[Path], ShapePrior]] = {
     PCAShapePrior.SCHEMA: PCAShapePrior.load,
@@ -29,10 +29,10 @@ def load_prior(source: Path | str) -> ShapePrior:
     """A prior of any kind, float32 on the CPU.
 
     Args:
-        source: "pca" or "neural" for a bundled one ("./neural" is a file), else a file of some prior's `save`.
+        source: "pca" or "neural" for a bundled prior ("./neural" is a file), else a file that a prior's `save` wrote.
 
     Raises:
-        DataFormatError: no such file, or not a whole file of any kind that is known.
+        DataFormatError: the file is missing, incomplete or of an unknown kind.
 
     Examples:
         >>> load_prior("pca").num_codes == load_prior("neural").num_codes

@@ -1,4 +1,4 @@
-"""Signed distance grids of triangle meshes as CAD files have them: open, with gaps, glass as loose sheets.
+"""This module makes signed distance grids of CAD files' meshes, which are open, have gaps and loose sheets of glass.
 
 The surface is voxelised finely, gaps are closed, what the outside cannot reach is solid, and the distance transform of
 that solid is sampled at the nodes of a coarser grid.
@@ -26,17 +26,17 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Voxels = NDArray[np.bool_]
 
-# A solid car fills 60 to 85 percent of its convex hull; a shell that the flood entered fills a few percent.
+# A solid car fills 60 to 85 percent of its convex hull; a shell that the flood fill entered fills a few percent.
 _LEAST_SHARE_OF_HULL = 0.4
-# Distance transforms need some twenty bytes for each.
+# Distance transforms need some twenty bytes for each voxel.
 _MOST_VOXELS = 2**27
-# Share of the size of a mesh: 8 mm of a car.
+# Rounding may move corners by at most this share of the size of a mesh, which is 8 mm for a car.
 _LARGEST_STEP = 0.002
 
 
 @dataclass(frozen=True)
 class GridSpec:
-    """Where the nodes of a signed distance grid lie, object frame, metres."""
+    """A `GridSpec` says where the nodes of a signed distance grid lie, in the object frame, in metres."""
 
     origin: tuple[float, float, float]
     spacing_m: float
@@ -49,7 +49,7 @@ class GridSpec:
 
     @classmethod
     def for_cars(cls, spacing_m: float = 0.1) -> GridSpec:
-        """Room for a car 5.2 m long, 2 m high and 2 m wide with 0.2 m or more around it, below the ground too.
+        """A grid for cars up to 5.2 m long, 2 m high and 2 m wide, with 0.2 m or more around them and below the ground.
 
         Examples:
             >>> GridSpec.for_cars().shape
@@ -62,14 +62,14 @@ class GridSpec:
 
     @classmethod
     def around(cls, low: Array, high: Array, spacing_m: float = 0.1) -> GridSpec:
-        """Room for shapes of any class between two corners (3,), object frame, with 0.3 m around them.
+        """A grid for shapes of any class between two corners (3,) in the object frame, with 0.3 m around them.
 
         Examples:
             >>> GridSpec.around(np.array([-0.3, -1.8, -0.3]), np.array([0.3, 0.0, 0.3])).shape
             (13, 25, 13)
         """
         first, last = np.floor((low - 0.3) / spacing_m + 1e-9), np.ceil((high + 0.3) / spacing_m - 1e-9)
-        # Symmetric about the middle plane.
+        # The grid is symmetric about the middle plane.
         last[2] = max(last[2], -first[2])
         first[2] = -last[2]
         nx, ny, nz = (int(count) + 1 for count in last - first)
@@ -79,7 +79,7 @@ class GridSpec:
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """How a mesh file is to be read and made solid."""
+    """`MeshOptions` say how a mesh file is to be read and made solid."""
 
     forward_axis: str = "+x"  # the file's axes that point to the car's front and up, as "-y"
     up_axis: str = "+z"
@@ -107,7 +107,7 @@ def load_mesh_obj(path: Path | str, options: MeshOptions | None = None) -> trime
     Raises:
         DataFormatError: the file cannot be read or holds no triangles.
         UnlikelyMeshError: the mesh does not look like a passenger car by the axes and scale of the options; the message
-            says by which ones it would. Not raised with `are_cars=False`.
+            says by which ones it would. `are_cars=False` switches this check off.
     """
     import trimesh
 
@@ -118,13 +118,13 @@ def place_mesh(mesh: trimesh.Trimesh, options: MeshOptions, name: str = "mesh") 
     """A copy of a mesh in the object frame, by the axes, scale and length of the options.
 
     Raises:
-        MeshError: corners so far from the origin that single precision has rounded them.
-        UnlikelyMeshError: as `load_mesh_obj`.
+        MeshError: the corners are so far from the origin that single precision has rounded them.
+        UnlikelyMeshError: the mesh does not look like a passenger car; see `load_mesh_obj`.
     """
     import trimesh
 
     mesh = mesh.copy()
-    # Corners of no triangle are not seen, and would move the mesh.
+    # Vertices without a triangle are invisible and would move the mesh.
     mesh.remove_unreferenced_vertices()
     _check_steps(np.asarray(mesh.vertices), name)
     if options.are_cars:
@@ -166,17 +166,18 @@ def mesh_to_sdf(
     """Signed distance of a mesh at the nodes of a grid, metres, negative inside, not truncated.
 
     Args:
-        mesh_obj: in the object frame, metres; need not be watertight.
+        mesh_obj: mesh in the object frame, metres; it need not be watertight.
         grid: where to sample; the mesh should lie inside.
-        options: voxel size, closing, symmetry and class (axes and scale are `load_mesh_obj`'s business).
-        name: for messages.
+        options: voxel size, closing, symmetry and class (only `load_mesh_obj` uses axes and scale).
+        name: name of the mesh, for messages.
 
     Returns:
-        (nx, ny, nz), about half a fine voxel exact.
+        Signed distances (nx, ny, nz), exact to about half a fine voxel.
 
     Raises:
         MeshError: the mesh cannot be made solid, or does not fit into the grid.
-        UnlikelyMeshError: in the object frame it does not look like a passenger car. Not raised with `are_cars=False`.
+        UnlikelyMeshError: the mesh does not look like a passenger car in the object frame. `are_cars=False` switches
+            this check off.
 
     Examples:
         >>> import trimesh
@@ -219,7 +220,7 @@ def _check_placed(mesh_obj: trimesh.Trimesh, name: str) -> None:
 def _check_fits(mesh_obj: trimesh.Trimesh, grid: GridSpec, name: str) -> None:
     low = np.array(grid.origin)
     high = low + grid.spacing_m * (np.array(grid.shape) - 1)
-    # Also where sizes have become infinite.
+    # Infinite sizes fail these comparisons, too.
     if not ((mesh_obj.bounds[0] >= low).all() and (mesh_obj.bounds[1] <= high).all()):
         raise MeshError(
             f"{name}: extents {np.round(mesh_obj.bounds, 2).tolist()} m leave the grid {low.round(2).tolist()} to "
@@ -229,11 +230,11 @@ def _check_fits(mesh_obj: trimesh.Trimesh, grid: GridSpec, name: str) -> None:
 
 
 def _voxelise(mesh_obj: trimesh.Trimesh, grid: GridSpec, options: MeshOptions) -> tuple[Voxels, Array]:
-    """Fine voxels that the surface passes through, with room for the closing, and the centre of the first."""
+    """Fine voxels that the surface passes through, with room for the closing, and the centre of the first voxel."""
     room = options.closing_m + 3 * options.voxel_m
     half_cell = 0.5 * options.voxel_m
     high = np.array(grid.origin) + grid.spacing_m * (np.array(grid.shape) - 1) + room
-    # Symmetric about the middle plane and covering the grid, so that both halves are sampled alike.
+    # The voxels are symmetric about the middle plane and cover the grid, so that both halves are sampled alike.
     high[2] = max(high[2], -grid.origin[2] + room)
     low = np.minimum(np.array(grid.origin) - room, [np.inf, np.inf, -high[2]])
     shape = [math.ceil(size) + 1 for size in (high - low) / options.voxel_m]
@@ -248,7 +249,7 @@ def _voxelise(mesh_obj: trimesh.Trimesh, grid: GridSpec, options: MeshOptions) -
 
 
 def _solid(surface: Voxels, mesh_obj: trimesh.Trimesh, options: MeshOptions, name: str) -> Voxels:
-    """What the outside cannot reach, with the narrowest closing that makes the mesh solid."""
+    """The voxels that the outside cannot reach, with the narrowest closing that makes the mesh solid."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
@@ -268,7 +269,7 @@ def _solid(surface: Voxels, mesh_obj: trimesh.Trimesh, options: MeshOptions, nam
 
 
 def _fill(surface: Voxels, radius: float) -> Voxels:
-    """Closes gaps of the surface voxels up to twice the radius, floods from outside and returns the rest."""
+    """Close gaps of the surface up to twice the radius wide, flood from outside and return the other voxels."""
     from scipy.ndimage import distance_transform_edt, label
 
     thick = distance_transform_edt(~surface) <= radius
@@ -280,7 +281,7 @@ def _fill(surface: Voxels, radius: float) -> Voxels:
 
 
 def _signed_distance(solid: Voxels, voxel_m: float) -> Array:
-    """Distance to the solid's outermost voxel centres: the surface passes through those voxels, on average there."""
+    """Signed distance to the outermost voxel centres of a solid, through which its surface passes on average."""
     from scipy.ndimage import distance_transform_edt
 
     outside = distance_transform_edt(~solid)

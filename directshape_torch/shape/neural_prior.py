@@ -1,7 +1,7 @@
-"""A small multilayer perceptron as a shape prior: code and point in, signed distance out. No grid anywhere.
+"""A small multilayer perceptron is a shape prior: it maps code and point to a signed distance, without any grid.
 
-Every layer adds a shift that is linear in the code, so binding a code costs one small product a car. The point enters
-mirrored smoothly about the middle plane of the car: shapes are symmetric by construction.
+Every layer adds a shift that is linear in the code, so binding a code costs one small product a car. The point is
+mirrored smoothly about the middle plane of the car before it enters, so all shapes are symmetric.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.shape.prior_file import PriorProvenance, read_prior, write_prior
 from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivatives
 
-# Half width of the zone about the middle plane where the mirrored coordinate `sqrt(z^2 + s^2)` is rounded.
+# The mirrored coordinate `sqrt(z^2 + s^2)` is rounded within this distance s of the middle plane.
 MIRROR_ROUNDING_M = 0.2
-# Typical frequency of the first layer before training: details of cars are a few decimetres large.
+# The first layer has this typical frequency before training, because details of cars are a few decimetres large.
 FIRST_RADIANS_PER_M = 3.0
 _MOST_NODES = 2**24
 _CURE = "make one with: python scripts/train_neural_prior.py"
-# Points that are computed together: their units stay in a core's cache, which is twice as fast.
+# This many points are computed together, so that their activations stay in a core's cache, which is twice as fast.
 _CHUNK_POINTS = 4096
 
 
 class CodedLinear(nn.Module):
-    """`W x + C code + b`."""
+    """This layer computes `W x + C code + b`."""
 
     def __init__(self, inputs: int, outputs: int, num_codes: int) -> None:
         super().__init__()
@@ -48,17 +48,17 @@ class CodedLinear(nn.Module):
 
 
 class NeuralShapePrior(nn.Module):
-    """Signed distance by a network of sine and SiLU layers with a whitened code; implements `ShapePrior`.
+    """This `ShapePrior` computes signed distances by a network of sine and SiLU layers with a whitened code.
 
-    All layers are smooth, so derivatives of any order exist inside the bounds. Its weights are parameters without
-    `requires_grad`, like those of a detector's frozen backbone; `prior.requires_grad_()` thaws them.
+    All layers are smooth, so derivatives of any order exist inside the bounds. The weights are parameters without
+    `requires_grad`; `prior.requires_grad_()` makes them trainable.
 
     Args:
         layer_widths: units of the hidden layers.
-        num_codes: K.
+        num_codes: number K of components of the code.
         origin: node (0, 0, 0) of the measuring grid in the object frame, (3,), metres.
         grid_shape: nodes of the measuring grid; it also spans the bounds of the field.
-        spacing_m: distance between its nodes.
+        spacing_m: distance between nodes of the measuring grid.
         provenance: where the weights come from.
 
     Raises:
@@ -89,7 +89,7 @@ class NeuralShapePrior(nn.Module):
         provenance: PriorProvenance,
     ) -> None:
         super().__init__()
-        # Not by `check_shape`: `load` makes the prior without numbers.
+        # `check_shape` would refuse the tensors without numbers of which `load` makes the prior.
         if not isinstance(origin, Tensor) or origin.shape != (3,):
             raise InputError("origin", "a tensor of shape (3,)", shown(origin))
         if not layer_widths or num_codes < 1:
@@ -158,13 +158,13 @@ class NeuralShapePrior(nn.Module):
 
     @classmethod
     def load(cls, path: Path | str) -> NeuralShapePrior:
-        """Read a file of `save`, float32 on the CPU; raises as `PCAShapePrior.load`."""
+        """Read a file that `save` wrote, as float32 on the CPU; it raises the errors of `PCAShapePrior.load`."""
 
         def make(tensors: dict[str, Tensor], made: PriorProvenance, settings: dict[str, Any]) -> NeuralShapePrior:
             widths, (nx, ny, nz) = settings["layer_widths"], settings["grid_shape"]
             if len(widths) > len(tensors) or math.prod((nx, ny, nz)) > _MOST_NODES:
                 raise ValueError(f"more layers than tensors, or more than {_MOST_NODES} nodes")
-            # Without memory and random numbers until it is filled: the sizes are those that somebody has written down.
+            # The sizes come from a file that may be wrong, so the prior takes no memory until it is filled.
             with torch.device("meta"):
                 origin = torch.zeros(3)
                 prior = cls(widths, settings["num_codes"], origin, (nx, ny, nz), settings["spacing_m"], made)
@@ -175,11 +175,11 @@ class NeuralShapePrior(nn.Module):
 
     @classmethod
     def load_bundled(cls) -> NeuralShapePrior:
-        """The passenger cars that come with the package (`scripts/train_neural_prior.py`; licence of this project)."""
+        """The prior of passenger cars in the package (by `scripts/train_neural_prior.py`; licence of this project)."""
         return cls.load(Path(__file__).parents[1] / "assets" / "neural_prior.safetensors")
 
     def coded_layers(self) -> list[CodedLinear]:
-        """The layers in order, sine first."""
+        """The layers in order, the sine layer first."""
         return [layer for layer in self.layers if isinstance(layer, CodedLinear)]
 
     def _nodes(self) -> Tensor:
@@ -191,7 +191,7 @@ class NeuralShapePrior(nn.Module):
 
 
 class NeuralShape:
-    """The fields of B objects with fixed codes (a `BoundShape`): a network with one shift a layer and object."""
+    """This `BoundShape` is a network with fixed codes of B objects: each layer has one shift for each object."""
 
     def __init__(
         self, weights: Sequence[Tensor], code_weights: Sequence[Tensor], shifts: Sequence[Tensor], bounds_obj: Tensor
@@ -215,8 +215,8 @@ class NeuralShape:
     def value_and_derivatives(self, points_obj: Tensor, object_index: Tensor) -> SdfDerivatives:
         """Value (P,), gradient (P, 3) and code derivative (P, K) at points (P, 3) of objects (P,).
 
-        One sweep forward that keeps each layer's slope, one back: the chain rule by hand, made of differentiable
-        operations. Backward costs one product a layer, forward-mode would cost 3 + K of them.
+        The chain rule is written out in differentiable operations: the way forward keeps the slope of each layer, and
+        the way back multiplies by it. The way back costs one product a layer, forward mode would cost 3 + K.
         """
         parts = [self._value_and_derivatives(*part) for part in _in_parts(points_obj, object_index)]
         return SdfDerivatives(*(torch.cat(field) for field in zip(*parts, strict=True)))
@@ -240,12 +240,12 @@ class NeuralShape:
         distance = _safe_norm(outward)
         direction = outward / torch.where(distance > 0, distance, torch.ones_like(distance))[:, None]
         gradient = J_value_x * _mirrored_slope(clamped)
-        # NaN is not equal to zero: a NaN point keeps its NaN to itself and passes none of it on.
+        # NaN is not equal to zero, so no NaN of a point passes through the network's gradient.
         gradient = torch.where(outward == 0, gradient, torch.zeros_like(gradient)) + direction
         return SdfDerivatives(value + distance, gradient, J_value_code)
 
     def _split(self, points_obj: Tensor) -> tuple[Tensor, Tensor]:
-        """The nearest points of the bounds and the way from there to the points, both (P, 3)."""
+        """The nearest points within the bounds and the vectors from there to the points, both (P, 3)."""
         clamped = torch.minimum(torch.maximum(points_obj, self._bounds[0]), self._bounds[1])
         return clamped, points_obj - clamped
 
@@ -258,7 +258,7 @@ def _in_parts(points_obj: Tensor, object_index: Tensor) -> Iterator[tuple[Tensor
 
 
 def _mirrored(points: Tensor) -> Tensor:
-    """`(x, y, sqrt(z^2 + s^2))`: the same for both halves of a car, and smooth."""
+    """Points `(x, y, sqrt(z^2 + s^2))`, which are smooth and equal for both halves of a car."""
     z = points[:, 2:]
     return torch.cat([points[:, :2], (z * z + MIRROR_ROUNDING_M**2).sqrt()], dim=1)
 

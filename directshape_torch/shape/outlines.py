@@ -1,4 +1,4 @@
-"""What is seen of a shape along its three axes: outlines on a few cells, in the box around the shape."""
+"""This module draws outlines of a shape along its three axes, on a few cells in the box around the shape."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 AXES = {sign + axis: k for k, axis in enumerate("xyz") for sign in "+-"}
-"""Signed axes by the number of the axis."""
+"""This maps each signed axis to the number of its axis."""
 
 _CELLS = 48
-# Share of the longest side between points of the surface: two a cell of the shortest side of a car.
+# Points of the surface are this share of the longest side apart, which is two points for each cell of the shortest
+# side of a car.
 _STEP = 0.003
 _POINTS_AT_ONCE = 2**21
 _SMALLEST, _LARGEST = 1e-150, 1e300
 
 
 def surface_points(triangles: Array, step: float) -> Iterator[Array]:
-    """Points (N, 3) on triangles (F, 3, 3), on barycentric lattices at most a `step` apart, some million at a time."""
+    """Points (N, 3) on triangles (F, 3, 3), on barycentric lattices at most a `step` apart, in parts of a million."""
     longest = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
     divisions = np.maximum(np.ceil(longest / step).astype(int), 1)
     for count in np.unique(divisions):
@@ -37,15 +38,15 @@ def surface_points(triangles: Array, step: float) -> Iterator[Array]:
 
 @dataclass(frozen=True)
 class Outlines:
-    """What is seen of a shape along each of its axes, cells filled or empty in the box around it."""
+    """`Outlines` tell which cells of the box around a shape are filled, as seen along each of its axes."""
 
-    size: Array  # (3,) of the box, in the units of the shape
+    size: Array  # (3,) size of the box, in the units of the shape
     along: tuple[Mask, Mask, Mask]  # (ny, nz), (nx, nz), (nx, ny): seen along x, y, z
 
     @classmethod
     def of_triangles(cls, triangles: Array) -> Outlines:
         """Outlines of a surface, which need not be closed, from its triangles (F, 3, 3)."""
-        # Brought to numbers of at most 1 first, so that no difference is too large for a number.
+        # Coordinates are scaled to at most 1 first, so that no difference overflows.
         unit = max(float(np.abs(triangles).max()), _SMALLEST)
         in_unit = triangles / unit
         low, high = in_unit.min(axis=(0, 1)), in_unit.max(axis=(0, 1))
@@ -72,7 +73,7 @@ class Outlines:
         return cls(spacing * np.array(inside.shape), (along_x, along_y, along_z))
 
     def seen(self, across: str, up: str) -> Mask:
-        """The outline whose rows go along one signed axis, as "-x", and whose columns along another."""
+        """The outline whose rows go along one signed axis, as "-x", and whose columns go along another."""
         a, b = AXES[across], AXES[up]
         view = self.along[3 - a - b]
         view = view if a < b else view.T

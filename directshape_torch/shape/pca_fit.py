@@ -1,4 +1,4 @@
-"""Principal components of signed distance grids: how a `PCAShapePrior` is made of cars, and how well it fits others."""
+"""This module makes a `PCAShapePrior` from signed distance grids of cars and measures how well it fits other cars."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.prior_file import PriorProvenance
 from directshape_torch.shape.zero_level import zero_level_extents
 
-# Spread of the weight of grid nodes about the samples' surfaces.
+# The weight of grid nodes about the samples' surfaces is a Gaussian of this width.
 _SURFACE_BAND_M = 0.2
 _NEAR_SURFACE_M = 0.07
 _LARGEST_CODE = 3.0
-# Of the mean squared derivative: codes that do not change the surface stay 0.
+# The diagonal of the normal matrix is raised by this share, so that dependent components have a solution.
 _RIDGE = 1e-8
 
 
@@ -32,9 +32,9 @@ def fit_pca(
     Args:
         sdf_samples: grids of N > num_codes cars, metres, untruncated.
         origin: node (0, 0, 0) of the grids, (3,), metres.
-        spacing_m: between their nodes.
-        num_codes: components to keep.
-        provenance: kept inside the prior.
+        spacing_m: distance between nodes of the grids.
+        num_codes: number of components to keep.
+        provenance: origin of the samples, which is kept inside the prior.
         surface_band_m: nodes count by how near they are to the samples' surfaces (Gaussian of this width), because
             refinement looks at the zero level only; the far field follows by regression. None counts all alike.
 
@@ -56,7 +56,7 @@ def fit_pca(
     samples = sdf_samples.double().flatten(1)
     mean = samples.mean(dim=0)
     code, explained = _whitened_codes(samples - mean, _surface_weight(samples, surface_band_m), num_codes)
-    # The code has mean 0, variance 1 and no correlations: the regression of anything on it is this product.
+    # The code has mean 0, variance 1 and no correlations, so a regression on the code is this product.
     basis = (samples - mean).T @ code / (len(samples) - 1)
     extents = zero_level_extents(sdf_samples.double(), origin.double(), spacing_m)
     dimensions = (extents[:, 1] - extents[:, 0])[:, [1, 2, 0]]
@@ -91,14 +91,15 @@ def fit_car(prior: PCAShapePrior, truth: Tensor) -> tuple[Tensor, float]:
     """The shape of a prior that is nearest to a known car, by least squares over the nodes near the car's surface.
 
     Args:
-        prior: on the CPU.
+        prior: a prior on the CPU.
         truth: (nx, ny, nz) signed distance of the car at the prior's nodes, metres.
 
     Returns:
-        Its code (K,), at most 3 standard deviations each, and the mean error within 7 cm of the surface, centimetres.
+        The code (K,) of the shape, at most 3 standard deviations each, and the mean error within 7 cm of the surface,
+        centimetres.
 
     Raises:
-        InputError: another grid, or fewer nodes near a surface than the prior has components.
+        InputError: the truth has another grid, or fewer nodes near a surface than the prior has components.
     """
     check_shape("truth", truth, prior.mean.shape, "sample it at the prior's own nodes")
     near = truth.abs() <= _NEAR_SURFACE_M
@@ -116,9 +117,9 @@ def leave_one_out_errors_cm(
     prior: PCAShapePrior,
     most: int = 60,
 ) -> Tensor:  # (min(N, most),)
-    """Error of `fit_car` for samples that a prior made of all others was fitted to, centimetres.
+    """Error of `fit_car` for samples with a prior that was made of all other samples, centimetres.
 
-    With more samples than `most`, that many evenly spaced ones are left out in turn.
+    Where there are more than `most` samples, `most` evenly spaced ones are left out in turn.
 
     Raises:
         InputError: fewer than three samples.
@@ -162,7 +163,7 @@ def _whitened_codes(centred: Tensor, weight: Tensor, num_codes: int) -> tuple[Te
     gram = (centred * weight) @ centred.T
     eigenvalues, vectors = torch.linalg.eigh(gram)
     eigenvalues, vectors = eigenvalues.flip(0).clamp_min(0), vectors.flip(1)[:, :num_codes]
-    # A component's sign is free: positive makes the car larger, so that priors made on different machines agree.
+    # The sign of a component is free. A positive code makes the car larger, so that priors of different machines agree.
     growth = centred.mean(dim=1) @ vectors
     vectors = vectors * torch.where(growth > 0, -1.0, 1.0)
     return vectors * (len(centred) - 1) ** 0.5, eigenvalues[:num_codes] / eigenvalues.sum()

@@ -1,4 +1,4 @@
-"""Principal components of signed distance grids as a shape prior with a whitened code (paper, section on the shape)."""
+"""Principal components of signed distance grids make a shape prior with a whitened code (paper, section on shape)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _CURE = "make one with: directshape build-prior"
 
 
 class PCAShapePrior(nn.Module):
-    """`sdf(X; code) = mean(X) + sum_k code_k basis_k(X)`, trilinear on a grid; implements `ShapePrior`.
+    """This `ShapePrior` is `sdf(X; code) = mean(X) + sum_k code_k basis_k(X)`, trilinear on a grid.
 
     Args:
         mean: signed distance of the mean shape, (nx, ny, nz), metres, negative inside.
@@ -114,12 +114,12 @@ class PCAShapePrior(nn.Module):
         return flat.reshape(-1, *self.mean.shape)
 
     def bind(self, code: Tensor) -> GridShape:
-        """The fields of B objects with codes (B, K): the basis collapses into one grid per object."""
+        """The fields of B objects with codes (B, K): the basis is summed up into one grid for each object."""
         return GridShape(self.values(code), self.basis, self.origin, self.spacing_m)
 
     @in_full_precision
     def dimensions_and_derivative(self, code: Tensor) -> DimensionsDerivative:
-        """Height, width and length (B, 3), metres, by the linear map of the training cars, and its derivative."""
+        """Height, width and length (B, 3), metres, by a linear map fitted to training cars, and their derivative."""
         check_shape("code", code, ("B", self.num_codes))
         check_alike("code", code, "the prior", self.mean)
         hwl = self.dimensions_mean_hwl + code @ self.dimensions_basis_hwl.T
@@ -129,7 +129,7 @@ class PCAShapePrior(nn.Module):
         """Write a safetensors file, atomically; grids in `torch.float16` halve it and round by less than 1 mm.
 
         Raises:
-            InputError: another `grid_dtype` than these two.
+            InputError: `grid_dtype` is neither `torch.float16` nor `torch.float32`.
         """
         if grid_dtype not in (torch.float16, torch.float32):
             raise InputError("grid_dtype", "torch.float16 or torch.float32", repr(grid_dtype))
@@ -139,10 +139,10 @@ class PCAShapePrior(nn.Module):
 
     @classmethod
     def load(cls, path: Path | str) -> PCAShapePrior:
-        """Read a file of `save`, float32 on the CPU.
+        """Read a file that `save` wrote, as float32 on the CPU.
 
         Raises:
-            DataFormatError: not such a file, truncated, another schema, or tensors that do not fit together.
+            DataFormatError: the file is missing, truncated or of another schema, or its tensors do not fit together.
         """
 
         def make(tensors: dict[str, Tensor], provenance: PriorProvenance, settings: dict[str, Any]) -> PCAShapePrior:
@@ -152,7 +152,7 @@ class PCAShapePrior(nn.Module):
 
     @classmethod
     def load_bundled(cls) -> PCAShapePrior:
-        """The passenger cars that come with the package (of parametric cars; licence of this project)."""
+        """The prior of passenger cars in the package (made of parametric cars; licence of this project)."""
         return cls.load(Path(__file__).parents[1] / "assets" / "car_prior.safetensors")
 
     def get_extra_state(self) -> Tensor:

@@ -1,4 +1,4 @@
-"""Files of shape priors: named tensors with a description in safetensors, which hold no code and cannot run any."""
+"""Files of shape priors are named tensors with a description, in the safetensors format, which cannot run code."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from directshape_torch.numerics.checks import check_type
 from directshape_torch.shape.car_looks import check_looks
 from directshape_torch.shape.outlines import Outlines
 
-# One key with JSON text, because the order of several keys in the file is not fixed.
+# The description is JSON text under one key, because the order of several keys in the file is not fixed.
 _KEY = "description"
 _NOT_WHOLE = "not a whole safetensors file"
 # Cells of this size show the road between the wheels.
@@ -29,7 +29,7 @@ _FINE_M = 0.05
 
 
 class _MadePrior(Protocol):
-    """What the looks of a prior are told by."""
+    """This is the part of a prior that the check of its looks needs."""
 
     @property
     def spacing_m(self) -> float: ...
@@ -44,7 +44,7 @@ _PriorT = TypeVar("_PriorT", bound=_MadePrior)
 
 @dataclass(frozen=True)
 class PriorProvenance:
-    """Where a prior comes from: kept inside its file."""
+    """A `PriorProvenance` says where a prior comes from, and is kept inside the prior's file."""
 
     made_by: str
     licence: str
@@ -73,13 +73,13 @@ def read_prior(
     cure: str,
     make: Callable[[dict[str, Tensor], PriorProvenance, dict[str, Any]], _PriorT],
 ) -> _PriorT:
-    """The prior that `make` makes of tensors, float32 on the CPU, of the provenance and of the settings in a file.
+    """The prior that `make` makes of the tensors (float32 on the CPU), the provenance and the settings in a file.
 
-    A `PriorWarning` says where the mean shape of a prior of cars does not look like a car.
+    A `PriorWarning` is given where the mean shape of a prior of cars does not look like a car.
 
     Raises:
-        DataFormatError: missing, truncated, of another schema, with values that are not finite numbers, or with
-            tensors and settings that do not fit together.
+        DataFormatError: the file is missing, truncated or of another schema, has values that are not finite numbers,
+            or has tensors and settings that do not fit together.
     """
     tensors, description = _read_tensors(Path(path), schema, cure)
     try:
@@ -108,10 +108,10 @@ def _warn_of_looks(path: Path | str, prior: _MadePrior) -> None:
 
 
 def read_description(path: Path, cure: str = "") -> dict[str, Any]:
-    """The description in a safetensors file; empty where it has none.
+    """The description in a safetensors file, which is empty where the file has none.
 
     Raises:
-        DataFormatError: no such file, or no safetensors file, or a truncated one.
+        DataFormatError: the file is missing, truncated or no safetensors file.
     """
     return _description(path, read_bytes(path, cure=cure), cure)
 
@@ -136,7 +136,7 @@ def _read_tensors(path: Path, schema: str, cure: str) -> tuple[dict[str, Tensor]
 
 
 def _description(path: Path, content: bytes, cure: str) -> dict[str, Any]:
-    """Of the header: eight bytes of its length, then JSON."""
+    """The description in the header of a file, which is eight bytes for its length, then JSON."""
     end = 8 + int.from_bytes(content[:8], "little")
     header = parse_json(path, content[8:end], cure, _NOT_WHOLE)
     metadata = header.get("__metadata__", {}) if isinstance(header, dict) and end <= len(content) else None

@@ -1,15 +1,17 @@
-"""Stacked signed distance grids: a shape of them, what points find in them, where rays come closest to their surface.
+"""This module looks points up in stacked signed distance grids and finds where rays come closest to the surface.
 
-Lookups take points (3, ...): coordinates apart, so that each arithmetic step runs over memory without a jump, and of
-any shape behind that, so that several depths of the same rays are one lookup. The corners of a cell are the axis before
-(8, ...), of which each interpolation takes the two halves: few and large operations, whose number is what a call of few
-cars costs. Outside the grid the field continues as the value at the nearest point of the grid plus the distance to it:
-continuous, growing, with a defined gradient. (It overestimates the true distance, so ray marching never steps by it.)
+Points are (3, ...). The coordinate is the first axis, so that each arithmetic step runs over memory without a jump. The
+other axes are free, so that several depths of the same rays are one lookup. The values at the corners of a cell are
+(8, ...), and each interpolation combines the two halves of the first axis. The operations are few and large, because
+their number sets the cost of a call of few cars. Outside the grid the field continues as the value at the nearest point
+of the grid plus the distance to that point: it is continuous, grows, and has a defined gradient. (It overestimates the
+true distance, so ray marching never steps by it.)
 
 Between the faces of cells the signed distance along a ray is a polynomial of degree 3, so its minimum is found exactly,
-cell by cell. It lies inside a cell, where the slope along the ray vanishes, or on a face, where the slope changes sign
-by a jump. There the closest point slides along the face as the car moves, which is what makes the derivative of the
-least distance that of the point (the envelope theorem) with the gradient that `RayMinimum.face_obj` corrects.
+cell by cell. The minimum lies inside a cell, where the slope along the ray vanishes, or on a face, where the slope
+changes sign by a jump. On a face the closest point slides along the face as the car moves. By the envelope theorem the
+derivative of the least distance is then the derivative at the fixed point, with the gradient that
+`RayMinimum.face_obj` corrects.
 """
 
 from __future__ import annotations
@@ -26,19 +28,19 @@ from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.shape.shape_prior import SdfDerivatives
 
-# Beside any distance nothing, and a normal number in single precision.
+# This number is negligible next to any distance, and a normal number in single precision.
 _TINY = 2e-38
-# A start so near to the face in front of it along the ray, in cells, begins behind it: where a search has ended on a
-# face, rounding does not choose the cell in which the next one begins, and beside a second face that cell is still one
-# of those that the ray comes through.
+# A search that begins within this distance along the ray, in cells, before a face begins behind the face. Where a search
+# has ended on a face, rounding therefore does not choose the cell in which the next search begins, and beside a second
+# face that cell is still one that the ray comes through.
 _ON_FACE = 1e-4
 _NO_STEP = 1e-12
-# Beside a slope of a thousandth, this one below a fraction bar is beyond all grids.
+# A slope of a thousandth divided by this number is a distance beyond all grids.
 _BEYOND_GRIDS = 1e-20
 
 
 class GridShape:
-    """B signed distance fields on one common grid, with the code derivative of all of them (a `BoundShape`).
+    """This `BoundShape` holds B signed distance fields on one grid and their common code derivative.
 
     Args:
         values: signed distance at the nodes, (B, nx, ny, nz), metres.
@@ -59,7 +61,7 @@ class GridShape:
 
     @property
     def field(self) -> GridField:
-        """What terms look up in."""
+        """The field in which terms look up signed distances."""
         last = constant_like(tuple(count - 1.0 for count in self.basis.shape[:3]), self.origin)
         return GridField(self.values.reshape(-1), self.basis, self.origin, last, self.spacing_m)
 
@@ -80,18 +82,19 @@ class GridShape:
 
 
 class GridField(NamedTuple):
-    """B signed distance grids of one geometry and the basis that they are made of: a `Field`."""
+    """This `Field` holds B signed distance grids of one geometry and the basis that they are made of."""
 
     values: Tensor  # (B * nx * ny * nz,) metres
     basis: Tensor  # (nx, ny, nz, K) metres per standard deviation
     origin: Tensor  # (3,) position of node (0, 0, 0), metres
-    # (3,) number of the last node along each axis: of constants the compiler makes choices, which cost as much as sums
+    # (3,) number of the last node along each axis; a tensor, because the compiler turns constants into choices, which
+    # cost as much as sums
     last: Tensor
-    spacing_m: float  # between nodes
+    spacing_m: float  # distance between nodes, metres
 
     @property
     def num_nodes(self) -> int:
-        """Of one grid."""
+        """Number of nodes of one grid."""
         return math.prod(self.basis.shape[:3])
 
     @property
@@ -100,29 +103,29 @@ class GridField(NamedTuple):
         return ny * nz, nz, 1
 
     def positions(self, points_obj: Tensor) -> Tensor:
-        """Points (3, ...) in cells from node (0, 0, 0)."""
+        """Positions of points (3, ...), in cells from node (0, 0, 0)."""
         return (points_obj - self.origin.view(3, *[1] * (points_obj.ndim - 1))) * (1 / self.spacing_m)
 
     def last_nodes(self, like: Tensor) -> Tensor:
-        """Number of the last node along each axis, as it goes with points (3, ...)."""
+        """Number of the last node along each axis, in a shape that broadcasts with points (3, ...)."""
         return self.last.view(3, *[1] * (like.ndim - 1))
 
     def steps(self, cells: Tensor) -> Tensor:
-        """What moves (3, ...) by whole cells, in floating point, add to the flat index (...) of a node."""
+        """Change (...) of the flat index of a node by moves (3, ...) of whole cells, in floating point."""
         (of_x, of_y, _), (x, y, z) = self._strides, cells.unbind(0)
         return torch.add(torch.add(z, y, alpha=of_y), x, alpha=of_x).int()
 
     def lower_nodes(self, cells: Tensor) -> Tensor:
-        """Flat index (...), within one grid, of the lower corners of cells (3, ...); a valid one of a NaN cell too."""
+        """Flat index (...), within one grid, of the lower corners of cells (3, ...); it is valid for NaN cells, too."""
         return self.steps(cells).clamp(0, self.num_nodes - 1 - self.steps_to_last_corner)
 
     @property
     def steps_to_last_corner(self) -> int:
-        """From the flat index of the lower corner of a cell to that of its upper one."""
+        """Difference of the flat indices of the upper and the lower corner of a cell."""
         return sum(self._strides)
 
     def nodes_of(self, node: Tensor, owner: Tensor) -> Tensor:
-        """Flat index (..., M, R) among the nodes of all grids, from that within one; 32 bits, for speed."""
+        """Flat index (..., M, R) among the nodes of all grids, from the index within one; it has 32 bits, for speed."""
         return torch.add(node, owner[..., None].int(), alpha=self.num_nodes)
 
     def at_corners(self, node: Tensor) -> Ends:
@@ -130,7 +133,7 @@ class GridField(NamedTuple):
         x, y, z = self._strides
         offsets = tuple(i * x + j * y + k * z for k in (0, 1) for j in (0, 1) for i in (0, 1))
         if torch.compiler.is_compiling():
-            # From a table of numbers the compiler makes choices, which keep it from vector instructions.
+            # The compiler would turn a table of numbers into choices, which keep it from using vector instructions.
             return [node + offset for offset in offsets]
         return node + constant_like(offsets, node).view(8, *[1] * node.ndim)
 
@@ -143,7 +146,7 @@ class GridField(NamedTuple):
         return _value_and_gradient(self, cells_at(self, points_obj), owner)[1]
 
     def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False, inside: bool = False) -> Lookup:
-        """In one pass; with `constant` the basis vectors of the corners are added in a faster way."""
+        """Value, gradient and code derivative in one pass; `constant` allows a faster sum of the basis vectors."""
         cells = cells_at(self, points_obj)
         value, gradient = _value_and_gradient(self, cells, owner, inside)
         table, corners = self.basis.flatten(0, 2), self.at_corners(cells.lower_node)
@@ -162,35 +165,35 @@ class GridField(NamedTuple):
         far: Tensor,
         max_cells: int,
     ) -> RayMinimum:
-        """Downhill from cell to cell until the distance grows again, `max_cells` at most.
+        """Go downhill from cell to cell until the distance grows again, through `max_cells` cells at most.
 
-        A minimum at `near` or `far` counts as smooth here: the caller knows what lies there. What is not found by
-        then waits on the face that it came to, and goes on from there when the ray is tracked next. A ray whose `near`
-        is its `far` stays there.
+        A minimum at `near` or `far` counts as smooth, because the caller knows what lies there. A search that has not
+        found its minimum by then stops on the face that it has reached, and goes on from there when the ray is tracked
+        next. A ray whose `near` equals its `far` stays there.
         """
         step, node, place = _cells_along(self, owner, centre_obj, direction_obj, depth, _ON_FACE)
         along = _derivatives_along(self, node, place, step)
-        # From here on a ray is seen the way the distance falls from where it begins, by how far it has come. There is
-        # no choice between two values by a condition in what follows: on a processor one costs as much as ten sums.
+        # From here on, positions on a ray are measured from its start in the direction in which the distance falls. The
+        # code below never chooses between two values by a condition, which costs a processor as much as ten sums.
         sign = -torch.copysign(torch.ones_like(depth), along.first)
         limit = torch.maximum(sign * (far - depth), sign * (near - depth))
         along = _AlongRay(-along.first.abs(), along.second, along.third * sign)
         heading = step * sign
         into_next = heading.sign()
         to_face, per_cell = (0.5 + 0.5 * into_next - place) / heading, into_next / heading
-        face = crossed = torch.zeros_like(heading)  # the last one, 1 at its axis; crossed now
+        face = crossed = torch.zeros_like(heading)  # 1 at the axis of the last face, and of the face crossed now
         come, running = torch.zeros_like(depth), limit > 0
         is_kink = torch.zeros_like(running)
         for number in range(max_cells):
             if number:
                 moves = crossed * into_next
-                # Rounding may lead a ray that ends at the border beyond it, of which nothing is used.
+                # Rounding may lead a ray that ends at the border beyond the border, where none of its results are used.
                 node = (node + self.steps(moves)).clamp(0, len(self.values) - 1 - self.steps_to_last_corner)
                 place = place - moves
                 to_face = torch.addcmul(to_face, crossed, per_cell)
-                # Who has arrived is where the slope vanishes, or grows: he stays.
+                # A ray that has arrived is where the slope vanishes or grows, so it stays.
                 along = _derivatives_along(self, node, torch.addcmul(place, come, heading), heading)
-            # Where it grows from the face on through which the ray came, the minimum is a kink on that face.
+            # Where the distance grows from the face on through which a ray came, the minimum is a kink on that face.
             is_kink = is_kink | ((along.first > 0) & running)
             root, exit_at = come + _first_root(along), to_face.amin(0)
             reach = torch.minimum(exit_at, limit)
@@ -208,7 +211,7 @@ class GridField(NamedTuple):
 
 
 class Lookup(NamedTuple):
-    """Value and derivatives at points (3, ...)."""
+    """A `Lookup` holds the value and the derivatives of a field at points (3, ...)."""
 
     value: Tensor  # (...) metres
     gradient: Tensor  # (3, ...)
@@ -216,14 +219,14 @@ class Lookup(NamedTuple):
 
 
 class RayMinimum(NamedTuple):
-    """The least signed distance along rays (M, R), near where it was looked for."""
+    """A `RayMinimum` says where rays (M, R) have their least signed distance, near where the search began."""
 
     depth: Tensor  # (M, R) metres
     face_obj: Tensor  # (3, M, R) normal of the face on which the minimum is a kink; zero where it is smooth
 
 
 class _AlongRay(NamedTuple):
-    """Coefficients (M, R) of the derivative by the distance, `first + 2 second t + 3 third t^2`, inside a cell."""
+    """The derivative by the distance t along a ray (M, R) is `first + 2 second t + 3 third t^2` inside a cell."""
 
     first: Tensor
     second: Tensor
@@ -231,46 +234,47 @@ class _AlongRay(NamedTuple):
 
 
 class Cells(NamedTuple):
-    """The grid cells that hold points (3, ...)."""
+    """`Cells` are the grid cells that hold points (3, ...)."""
 
     lower_node: Tensor  # (...) flat index, within one grid, of the cell's lower corner
     fraction: Tensor  # (3, ...) position inside the cell, 0..1
-    position: Tensor  # (3, ...) of the point, in cells from node (0, 0, 0)
-    nearest: Tensor  # (3, ...) that of the nearest point of the grid
+    position: Tensor  # (3, ...) position of the point, in cells from node (0, 0, 0)
+    nearest: Tensor  # (3, ...) position of the nearest point of the grid
 
     @property
     def outward(self) -> tuple[Tensor, Tensor]:
-        """From the nearest point of the grid (3, ...), and how far (...), in cells; next to nothing inside."""
+        """Vectors (3, ...) from the nearest points of the grid, and lengths (...), in cells; next to 0 inside."""
         outward = self.position - self.nearest
-        # The root of zero has no derivative, and takes a processor five times as long as any other.
+        # The root of zero has no derivative, and takes a processor five times as long as other roots.
         return outward, ((outward * outward).sum(0) + _TINY).sqrt()
 
 
 def cells_at(field: GridField, points_obj: Tensor) -> Cells:
-    """The cells at points (3, ...). A NaN point gets a valid cell, at a distance of NaN: it cannot disturb others."""
+    """The cells at points (3, ...). A NaN point gets a valid cell at a distance of NaN and cannot disturb others."""
     position = field.positions(points_obj)
     last = field.last_nodes(position)
-    # Not `minimum`, which halves derivatives on the last faces.
+    # `minimum` instead of `clamp_max` would halve derivatives on the last faces.
     clamped = position.clamp_min(0).clamp_max(last)
     lower = clamped.detach().floor().minimum(last - 1)
     return Cells(field.lower_nodes(lower), clamped - lower, position, clamped)
 
 
-# Values (n, ...) at ends of edges; for the compiler, which makes one loop of tensors of one shape, n of them (...).
+# `Ends` are values at the ends of edges: one tensor (n, ...), or n tensors (...) for the compiler, which makes one loop
+# of tensors of one shape.
 Ends: TypeAlias = Tensor | list[Tensor]
 
 
 def corner_values(field: GridField, node: Tensor) -> Ends:
-    """Signed distances (8, ...) at the corners of cells with lower node (...) among those of all grids."""
+    """Signed distances (8, ...) at the corners of cells, from their lower nodes (...) among the nodes of all grids."""
     corners = field.at_corners(node)
     if isinstance(corners, list):
-        # An embedding's indices are known not to be negative.
+        # The compiler knows that indices of an embedding are at least 0.
         return [embedding(corner, field.values[:, None])[..., 0] for corner in corners]
     return field.values.index_select(0, corners.view(-1)).view(corners.shape)
 
 
 def halves(ends: Ends) -> tuple[Ends, Ends]:
-    """The lower ends (n, ...) along the outermost axis that is left, and by how much the upper ones are above them."""
+    """The lower half of the ends, along the outermost remaining axis, and the rises from there to the upper half."""
     if isinstance(ends, list):
         half = len(ends) // 2
         return ends[:half], [upper - lower for lower, upper in zip(ends[:half], ends[half:], strict=True)]
@@ -279,7 +283,7 @@ def halves(ends: Ends) -> tuple[Ends, Ends]:
 
 
 def moved(lower: Ends, fraction: Tensor, rise: Ends) -> Ends:
-    """`lower + fraction rise`."""
+    """The ends `lower + fraction rise`."""
     if isinstance(lower, list):
         return [torch.addcmul(low, fraction, along) for low, along in zip(lower, rise, strict=True)]
     assert isinstance(rise, Tensor)
@@ -287,7 +291,7 @@ def moved(lower: Ends, fraction: Tensor, rise: Ends) -> Ends:
 
 
 def scaled(factor: Tensor, ends: Ends) -> Ends:
-    """`factor ends`."""
+    """The ends times a factor."""
     return [factor * end for end in ends] if isinstance(ends, list) else factor * ends
 
 
@@ -313,14 +317,14 @@ def _between(ends: Ends, fraction: Tensor) -> Ends:
 
 
 def _interpolated(corners: Ends, fraction: Tensor) -> Tensor:
-    """Of the corners (8, ...) of cells, at fractions (3, ...) along the axes."""
+    """The values inside cells, from their corners (8, ...) and the fractions (3, ...) along the axes."""
     for along in reversed(fraction.unbind(0)):
         corners = _between(corners, along)
     return corners[0]
 
 
 def _summed(table: Tensor, corners: Tensor, fraction: Tensor) -> Tensor:
-    """`_interpolated` as one weighted sum of table rows: one pass instead of three."""
+    """The values of `_interpolated` by one weighted sum of table rows: one pass instead of three."""
     x, y, z = torch.stack([1 - fraction, fraction], dim=1)
     weight = z[:, None, None] * (y[:, None] * x)
     node, share = (per_corner.reshape(8, -1).mT.contiguous() for per_corner in (corners, weight))
@@ -345,7 +349,7 @@ def _cells_along(
 def _derivatives_along(field: GridField, node: Tensor, place: Tensor, step: Tensor) -> _AlongRay:
     """Coefficients of the polynomial along a ray in the cell with lower node (M, R), at a place (3, M, R) in it."""
     (ux, uy, uz), (dx, dy, dz) = place, step
-    # Interpolated along z, then y, then x: each time a polynomial of the distance gains a degree.
+    # The corners are interpolated along z, then y, then x, and each time the polynomial of the distance gains a degree.
     lower, rise = halves(corner_values(field, node))
     (a0, rise_0), (a1, rise_1) = halves(moved(lower, uz, rise)), halves(scaled(dz, rise))
     b1 = moved(moved(a1, uy, rise_1), dy, rise_0)
@@ -356,13 +360,13 @@ def _derivatives_along(field: GridField, node: Tensor, place: Tensor, step: Tens
 
 
 def _first_root(along: _AlongRay) -> Tensor:
-    """Distance (M, R) downhill to where the slope vanishes: 0 where it has done so already, huge where it never does.
+    """Distance (M, R) downhill to where the slope vanishes: 0 where the slope is not negative, huge without a root.
 
-    With `c + 2 b s + 3 a s^2` the slope at a distance s downhill (c < 0), its first root is `-c / (b + sqrt(b^2 -
-    3 a c))`, without cancellation.
+    The slope at a distance s downhill is `c + 2 b s + 3 a s^2` (c < 0). Its first root is `-c / (b + sqrt(b^2 -
+    3 a c))`, which is free of cancellation.
     """
     first, second, third = along
     discriminant = torch.addcmul(second * second, third, first, value=-3)
-    # The root of a negative number takes many times as long as that of another.
+    # The root of a negative number takes many times as long as other roots.
     below = (second + discriminant.clamp_min(0).sqrt()).clamp_min(0) * discriminant.sign().clamp_min(0)
     return (-first).clamp_min(0) / (below + _BEYOND_GRIDS)

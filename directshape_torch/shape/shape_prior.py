@@ -1,4 +1,4 @@
-"""What every shape model offers to ray casting, silhouettes and meshing: a signed distance field bound to a code.
+"""Every shape model offers a signed distance field bound to a code, for ray casting, silhouettes and meshing.
 
 Signed distances are in metres and NEGATIVE inside (the paper's Phi is positive inside: `Phi = -sdf`). Points are in
 the object frame: x forward, y down, origin on the ground under the box centre.
@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 class SdfDerivatives(NamedTuple):
-    """Value and first derivatives of a signed distance field at P points, from one lookup."""
+    """`SdfDerivatives` are the value and first derivatives of a signed distance field at P points, from one lookup."""
 
     value: Tensor  # (P,) metres
     gradient: Tensor  # (P, 3) d value / d point_obj
@@ -21,14 +21,14 @@ class SdfDerivatives(NamedTuple):
 
 
 class DimensionsDerivative(NamedTuple):
-    """Outer dimensions of B shapes as a prior predicts them from the code, and their derivative."""
+    """These are the outer dimensions of B shapes that a prior predicts from the code, and their derivative."""
 
     hwl: Tensor  # (B, 3) height, width, length, metres
     J_hwl_code: Tensor  # (B, 3, K) metres per standard deviation
 
 
 class BoundShape(Protocol):
-    """Signed distance fields of B objects whose codes are fixed."""
+    """A `BoundShape` is the signed distance fields of B objects whose codes are fixed."""
 
     def value(
         self,
@@ -48,11 +48,11 @@ class BoundShape(Protocol):
 
 
 class ShapePrior(Protocol):
-    """A family of shapes with a whitened code: component k has standard deviation 1.
+    """A `ShapePrior` is a family of shapes with a whitened code: each component has standard deviation 1.
 
-    The refiner, its terms, results, batch program and pictures know nothing else of a prior. A prior is an `nn.Module`,
-    so that it moves with `.to(...)` and lives in a `state_dict`; its dtype and device are those of `origin`. Nothing is
-    said of how a shape is encoded: derivatives may depend on the code.
+    The refiner, its terms, results, batch program and pictures use nothing else of a prior. A prior is an `nn.Module`,
+    so that `.to(...)` moves it and a `state_dict` holds it; it has the dtype and device of `origin`. Shapes may be
+    encoded in any way, and derivatives may depend on the code.
     """
 
     @property
@@ -70,7 +70,7 @@ class ShapePrior(Protocol):
 
     @property
     def spacing_m(self) -> float:
-        """Distance between the nodes of that grid."""
+        """Distance between the nodes of the measuring grid."""
         ...
 
     def initial_code(self, num_objects: int) -> Tensor:
@@ -99,9 +99,9 @@ class ShapePrior(Protocol):
         ...
 
     def named_buffers(self) -> Iterator[tuple[str, Tensor]]:
-        """Its constants by name, as of an `nn.Module`."""
+        """Constants of the prior by name, as from an `nn.Module`."""
         ...
 
     def named_parameters(self) -> Iterator[tuple[str, Tensor]]:
-        """Its trained weights by name, as of an `nn.Module`."""
+        """Trained weights of the prior by name, as from an `nn.Module`."""
         ...

@@ -1,4 +1,4 @@
-"""The surface of signed distance grids: the box around their zero level, and its triangle mesh."""
+"""This module finds the box around the zero level of signed distance grids, and the triangle mesh of the surface."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def zero_level_extents(
 
     The field is trilinear between nodes, so along an axis the outermost point of its zero level lies on a grid edge
     parallel to that axis (up to cells that the level only touches in their middle): the extent is the outermost linear
-    crossing of all edges of the axis. Differentiable by `values`: the gradient flows through the outermost edge.
+    crossing of all edges of the axis. It is differentiable by `values`: the gradient flows through the outermost edge.
 
     Examples:
         >>> x = torch.arange(-3.0, 4.0)
@@ -71,8 +71,8 @@ def sdf_to_mesh(
         values: signed distance at the nodes, metres, negative inside.
         origin: node (0, 0, 0) in the object frame, metres.
         spacing_m: distance between nodes.
-        T_cam_obj: object to camera; None leaves the mesh in the object frame.
-        level_m: which level; 0 is the surface. Where it leaves the grid the mesh is closed at the grid's border.
+        T_cam_obj: pose from object to camera; None leaves the mesh in the object frame.
+        level_m: the level; 0 is the surface. Where the level leaves the grid, the mesh is closed at the border.
 
     Raises:
         InputError: wrong shapes.
@@ -94,8 +94,8 @@ def sdf_to_mesh(
     above = values.detach().double().cpu().numpy() - level_m
     if not ((above < 0).any() and (above > 0).any()):
         raise MeshError(f"the signed distance grid does not cross the level {level_m} m: it has no surface to mesh")
-    # Closed at the border by one more node, outside. "descent": the field falls towards the object, so that the faces'
-    # normals point outward.
+    # One more node, outside, closes the mesh at the border. With "descent" the field falls towards the object, so that
+    # the normals of the faces point outward.
     padded = np.pad(above, 1, constant_values=spacing_m)
     extract: Callable[..., tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]] = marching_cubes
     vertices, faces, _, _ = extract(padded, 0.0, spacing=(spacing_m,) * 3, gradient_direction="descent")
