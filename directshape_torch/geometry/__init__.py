@@ -1,1 +1,1 @@
-"""Rigid motions, cameras, boxes, planes and the residual disparity of a rig."""
+"""This package holds rigid motions, cameras, boxes, planes and the residual disparity of a rig."""

@@ -1,4 +1,4 @@
-"""3D boxes in KITTI's convention, to and from rigid transforms.
+"""This module turns 3D boxes in KITTI's convention into rigid transforms and back.
 
 The object frame is x forward (length), y down, z = x cross y, origin on the ground under the box centre. With
 `rotation_y = 0` its axes are parallel to the camera's; `rotation_y` turns about the y axis, which points down.
@@ -56,7 +56,7 @@ def alpha_from_kitti(
 
 @in_full_precision
 def viewing_axes(origin_cam: Tensor) -> Tensor:
-    """Unit vectors (B, 3, 3), rows: along the viewing ray of points (B, 3) with y left out, across it, and down."""
+    """Unit vectors (B, 3, 3) as rows: along the viewing rays of points (B, 3) without y, across the rays, and down."""
     x, z = origin_cam[:, 0], origin_cam[:, 2]
     distance = torch.sqrt(x * x + z * z)
     zero, one = torch.zeros_like(x), torch.ones_like(x)
@@ -71,8 +71,8 @@ def box_corners(
 ) -> Tensor:
     """The 8 corners (*, 8, 3) of boxes standing on the origin of their object frame, in frame a.
 
-    Order, as in KITTI's devkit: the four ground corners (front left of travel first, then front right and round), then
-    the four above them.
+    The order is that of KITTI's devkit: the four ground corners (front left of travel first, then front right and
+    round), then the four corners above them.
 
     Examples:
         >>> corners = box_corners(torch.eye(4), torch.tensor([1.5, 1.6, 4.0]))
@@ -87,7 +87,7 @@ def box_corners(
     return transform(T_a_obj[..., None, :, :], torch.stack([x, y, z], dim=-1))
 
 
-# Pairs of `box_corners` indices that form the 12 edges of a box.
+# These pairs of `box_corners` indices are the 12 edges of a box.
 BOX_EDGES: tuple[tuple[int, int], ...] = (
     (0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""3D boxes as detectors write them, (N, 7) numbers or (N, 8, 3) corners, to poses in the camera frame and back.
+"""This module turns boxes as detectors write them, (N, 7) numbers or (N, 8, 3) corners, into poses and back.
 
 | format | frame | location | sizes | heading |
 |---|---|---|---|---|
@@ -9,11 +9,11 @@
 | `openpcdet` | LiDAR | centre | l w h (dx dy dz) | as `mmdet3d_lidar` |
 | `nuscenes` | LiDAR, ego or global | centre | w l h | 0 along x, pi/2 along y |
 
-Camera frames have x right, y down, z forward; in the others z is up, and where x points is their own matter:
-forward for `mmdet3d_lidar` and `openpcdet`, to the right in nuScenes' LIDAR_TOP. MMDetection3D is that of version 1.0
-and later, where headings changed. Corners are in the order of each tool: KITTI's devkit (and `opencv`), MMDetection3D's
-`corners`, OpenPCDet's `boxes_to_corners_3d`, nuScenes' `Box.corners()`, transposed to (8, 3). KITTI's "ref" is a camera
-frame beside the left one: `T_cam_boxes=camera.T_cam_ref`.
+Poses are in the frame of the left camera. Camera frames have x right, y down, z forward. In the other frames z is up,
+and x depends on the tool: it points forward for `mmdet3d_lidar` and `openpcdet`, and to the right in nuScenes'
+LIDAR_TOP. MMDetection3D means version 1.0 or later, where headings changed. Corners are in the order of each tool:
+KITTI's devkit (and `opencv`), MMDetection3D's `corners`, OpenPCDet's `boxes_to_corners_3d`, nuScenes' `Box.corners()`,
+transposed to (8, 3). KITTI's "ref" is a camera frame next to the left camera: `T_cam_boxes=camera.T_cam_ref`.
 """
 
 from __future__ import annotations
@@ -33,15 +33,16 @@ from directshape_torch.numerics.conversion import Given, as_floating
 from directshape_torch.numerics.full_precision import in_full_precision
 
 BoxFormat = Literal["kitti", "mmdet3d_camera", "mmdet3d_lidar", "openpcdet", "nuscenes", "opencv"]
-# Headings that were added up go beyond one turn; degrees soon go beyond two.
+# Headings that were added up may exceed one turn; headings in degrees mostly exceed two.
 _MOST_TURNS = 2
-# Corners that were rounded to centimetres still make a box, those in another order do not.
+# Corners that were rounded to centimetres are within this distance of a box; corners in a wrong order are not.
 _CORNER_TOLERANCE_M = 0.05
-# Axes of the object frame (x forward, y down, z left) in those of a box whose z is up (x forward, y left).
+# These are the axes of the object frame (x forward, y down, z left) in a box frame (x forward, y left, z up).
 _OBJ_IN_UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
-# Cosine of the largest angle by which boxes lean: no camera on a car leans by 60 degrees.
+# Boxes lean by less than the angle of this cosine, because no camera on a car leans by 60 degrees.
 _LEAST_UPRIGHT = 0.5
-# Corners along the object's x, y and z: 1 at the front, the ground, the left of travel. OpenPCDet's order is KITTI's.
+# A corner is its signs along the object's x, y and z: 1 at the front, the ground, the left of travel. OpenPCDet has
+# KITTI's order.
 _DEVKIT = ((1, 1, 1), (1, 1, -1), (-1, 1, -1), (-1, 1, 1), (1, -1, 1), (1, -1, -1), (-1, -1, -1), (-1, -1, 1))
 _MMDET3D_CAMERA = ((-1, -1, -1), (-1, -1, 1), (-1, 1, 1), (-1, 1, -1), (1, -1, -1), (1, -1, 1), (1, 1, 1), (1, 1, -1))
 _MMDET3D_LIDAR = ((-1, 1, -1), (-1, -1, -1), (-1, -1, 1), (-1, 1, 1), (1, 1, -1), (1, -1, -1), (1, -1, 1), (1, 1, 1))
@@ -50,15 +51,15 @@ _NUSCENES = ((1, -1, 1), (1, -1, -1), (1, 1, -1), (1, 1, 1), (-1, -1, 1), (-1, -
 
 @dataclass(frozen=True)
 class BoxForm:
-    """How a tool writes boxes.
+    """A `BoxForm` says how a tool writes boxes.
 
     Attributes:
         sizes: order of height, width and length.
         raised: share of the height by which the location lies above the bottom.
-        upright: z is up; else a camera's axes.
-        corners: signs along the object's axes.
-        frame: its axes, in words.
-        heading: what its heading counts, in words.
+        upright: whether z is up; else the axes are a camera's.
+        corners: signs of the corners along the object's axes.
+        frame: axes of the frame, in words.
+        heading: meaning of the heading, in words.
         heading_of_right: heading of a car that drives to the right of a camera that looks ahead, radians.
     """
 
@@ -72,12 +73,12 @@ class BoxForm:
 
     @property
     def place(self) -> str:
-        """Which point of a box its location is."""
+        """The point of a box that its location gives, in words."""
         return "the centre of the box" if self.raised else "the centre of the box's bottom face"
 
     @property
     def order(self) -> str:
-        """The three sizes, in their order."""
+        """The names of the three sizes, in order."""
         names = {"h": "height", "w": "width", "l": "length"}
         return ", ".join(names[size] for size in self.sizes)
 
@@ -105,10 +106,10 @@ def boxes_to_poses(
     convention: BoxFormat,
     T_cam_boxes: Given | None = None,  # (4, 4) or (N, 4, 4), from the frame of the boxes to the left camera
 ) -> tuple[Tensor, Tensor]:
-    """`T_cam_obj` (N, 4, 4) and heights, widths and lengths (N, 3) of boxes in one of the formats above.
+    """`T_cam_obj` (N, 4, 4) and heights, widths and lengths (N, 3) of boxes in a format of this module.
 
-    Boxes may be an array or a list. The poses are float64 where the boxes are, else float32, which half precision
-    becomes too: a box from a network in bfloat16 at 20 m is known to 6 cm, but is not rounded again.
+    Boxes may be an array or a list. The poses are float64 where the boxes are, else float32, also for half precision: a
+    box from a network in bfloat16 at 20 m is known to 6 cm, but is not rounded again.
 
     Raises:
         InputError: an unknown convention, another shape, a frame with z up without `T_cam_boxes`, or corners that
@@ -137,7 +138,7 @@ def poses_to_boxes(
     convention: BoxFormat,
     T_cam_boxes: Given | None = None,  # (4, 4) or (N, 4, 4), from the frame of the boxes to the left camera
 ) -> Tensor:
-    """Boxes (N, 7) in one of the formats above; of the rotation only the heading is left.
+    """Boxes (N, 7) in a format of this module, which keep only the heading of the rotation.
 
     Raises:
         InputError: an unknown convention, or a frame with z up without `T_cam_boxes`.
@@ -159,7 +160,7 @@ def poses_to_boxes(
 
 
 def box_form(convention: str) -> BoxForm:
-    """How boxes of a convention are written, with words for it.
+    """The `BoxForm` of a convention.
 
     Raises:
         InputError: an unknown convention.
@@ -176,7 +177,7 @@ def is_z_up(convention: BoxFormat) -> bool:
 
 
 def check_upright(T_cam_boxes: Tensor, convention: BoxFormat) -> None:
-    """Raise `InputError` where a motion (4, 4) or (N, 4, 4) to the camera does not take up to up, as its inverse."""
+    """Raise `InputError` where a motion (4, 4) or (N, 4, 4) to the camera tilts boxes by more than 60 degrees."""
     form = box_form(convention)
     axis, name, sign = (2, "z", 1.0) if form.upright else (1, "y", -1.0)
     R = T_cam_boxes.detach().reshape(-1, 4, 4)[:, :3, :3]
@@ -223,7 +224,7 @@ def _from_numbers(boxes: Tensor, form: BoxForm) -> tuple[Tensor, Tensor]:
     check_rows("boxes", heading.detach().abs() > _MOST_TURNS * 2 * math.pi, boxes.detach(), expected, cure)
     hwl = sizes[:, [form.sizes.index(size) for size in "hwl"]]
     if form.upright:
-        turn = rotation_about_y(-heading)  # about y one way is about z the other, with y and z exchanged
+        turn = rotation_about_y(-heading)  # a turn about y is one about z the other way, with y and z exchanged
         R = boxes.new_tensor(_OBJ_IN_UPRIGHT) @ turn
     else:
         R = rotation_about_y(heading)
@@ -232,21 +233,24 @@ def _from_numbers(boxes: Tensor, form: BoxForm) -> tuple[Tensor, Tensor]:
 
 
 def _half_edges(corners: Tensor, form: BoxForm) -> tuple[Tensor, Tensor, Tensor]:
-    """Half edges (N, 3, 3) of corners (N, 8, 3), rows along the object's x, y, z; how far corners are from such a box
-    (N,), metres; and where they are none that stands (N,)."""
+    """Half edges (N, 3, 3) of corners (N, 8, 3), distances (N,) of the corners from a box, and which (N,) are wrong.
+
+    Rows of the half edges are along the object's x, y and z. Distances are in metres. Corners are wrong where they make
+    no box that stands upright.
+    """
     sign = corners.new_tensor(form.corners)
     half = torch.einsum("nci,ck->nki", corners, sign) / 8
     error = (corners - corners.mean(dim=1, keepdim=True) - sign @ half).norm(dim=-1).amax(dim=1)
     askew = (half @ half.mT / half.square().sum(dim=(1, 2), keepdim=True)).triu(1).abs().amax(dim=(1, 2))
     left_handed = torch.linalg.det(half.double()) < 0
-    # Another tool's order turns a box by right angles, which makes a box again: mostly one on its side.
+    # The order of another tool turns a box by right angles into another box, which mostly lies on its side.
     height = half[:, 1] if not form.upright else -half[:, 1]
     rises = height[:, 2 if form.upright else 1] / height.norm(dim=1)
     return half, error, (error > _CORNER_TOLERANCE_M) | (askew > 0.02) | left_handed | (rises < _LEAST_UPRIGHT)
 
 
 def _cure_of_corners(corners: Tensor, convention: str) -> str:
-    """The order in words, and the conventions in whose order and frame the corners (8, 3) of a box would be."""
+    """Advice for corners (8, 3): the conventions whose order and frame they fit, else the right order in words."""
     others = [name for name, form in _FORMS.items() if not _half_edges(corners[None], form)[2].item()]
     if others:
         return f"they are in the order of {' or '.join(map(repr, others))}: give that convention"
@@ -267,7 +271,8 @@ def _from_corners(corners: Tensor, form: BoxForm, convention: str) -> tuple[Tens
         cure = _cure_of_corners(corners[row], convention)
         raise InputError("boxes", f"corners in the order of {convention!r}", got, cure)
     length_height_width = 2 * half.norm(dim=2)
-    # The nearest rotation, as corners are rounded; none of numbers that are not finite, or where an edge has no length.
+    # Corners are rounded, so the nearest rotation is taken; it is NaN where corners are not finite or an edge has no
+    # length.
     axes = (half / half.norm(dim=2, keepdim=True)).double().mT
     U, _, Vh = torch.linalg.svd(axes.nan_to_num(0, 0, 0))
     R = (U @ Vh + 0 * axes.sum(dim=(1, 2), keepdim=True)).to(corners)

@@ -1,9 +1,10 @@
-"""Residual disparity of a stereo rig: measured minus true disparity, and row offset, smooth over the left image.
+"""This module holds the residual disparity and row offset of a stereo rig, which are smooth over the left image.
 
-Rectification leaves a residue of some tenths of a pixel (KITTI: -0.3 in the image centre, -1.2 at its left edge).
-At 30 m half a pixel is 1.2 m of depth, so it decides whether far cars come out right. Known in visual odometry: Kreso
-and Segvic, "Improving the Egomotion Estimation by Correcting the Calibration Bias", VISAPP 2015. The rows are off too
-(KITTI: -0.2 to +0.3 px across the image), and on slanted texture a row offset that is ignored looks like disparity.
+Residual disparity is measured minus true disparity. Rectification leaves some tenths of a pixel (KITTI: -0.3 in the
+image centre, -1.2 at its left edge). At 30 m half a pixel is 1.2 m of depth, so the residual decides whether far cars
+come out right. Visual odometry knows the effect: Kreso and Segvic, "Improving the Egomotion Estimation by Correcting
+the Calibration Bias", VISAPP 2015. The rows are off, too (KITTI: -0.2 to +0.3 px across the image), and on slanted
+texture a row offset that is ignored looks like disparity.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from directshape_torch.numerics.conversion import as_floating
 from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.numerics.gradient_mode import is_plain
 
-# Exponents of the normalised (u, v) in each basis function: 1, u, v, u^2, uv, v^2, u^3, u^2 v, u v^2, u^4.
+# These are the exponents of the normalised (u, v) in the functions 1, u, v, u^2, uv, v^2, u^3, u^2 v, u v^2, u^4.
 EXPONENTS: tuple[tuple[int, int], ...] = (
     (0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (4, 0),
 )  # fmt: skip
@@ -55,7 +56,7 @@ def nearest_in_convex_polygon(
     flat, polygon = points.reshape(-1, 2).to(dtype), polygon.to(dtype)
     inside = _is_inside(flat, polygon)
     if points.device.type == "cpu" and is_plain(points):
-        # Few are outside; elsewhere asking which ones would let the host wait.
+        # Few points are outside. On other devices, asking which ones would make the host wait.
         outside = (~inside).nonzero()[:, 0]
         moved = flat.index_copy(0, outside, _nearest_on_border(flat[outside], polygon))
     else:
@@ -65,7 +66,7 @@ def nearest_in_convex_polygon(
 
 def _is_inside(points: Tensor, polygon: Tensor) -> Tensor:
     """Whether points (P, 2) lie in the polygon, (P,)."""
-    # Edge by edge, so that each step runs over all points without a jump.
+    # The edges are the first axis, so that each step runs over the memory of all points without a jump.
     (x, y), (p_x, p_y) = points.unbind(dim=1), polygon[:, None].unbind(dim=2)
     e_x, e_y = (polygon.roll(-1, dims=0) - polygon)[:, None].unbind(dim=2)
     side = e_x * (y - p_y) - e_y * (x - p_x)
@@ -84,18 +85,18 @@ def _nearest_on_border(points: Tensor, polygon: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class DisparityField:
-    """`bias(u, v)` = measured minus true disparity in pixels, a polynomial over the left image of one rig.
+    """`bias(u, v)` is measured minus true disparity in pixels, a polynomial over the left image of one rig.
 
     Attributes:
-        coefficients: (10,), pixels, of `polynomial_basis`: the residual disparity.
-        vertical_coefficients: (10,), pixels: measured minus predicted row in the right image.
-        hull_uv: (M, 2) convex polygon around the data of the fit, pixels; beyond it the value at its nearest point is
-            used, because polynomials run away.
+        coefficients: (10,) of the residual disparity in `polynomial_basis`, pixels.
+        vertical_coefficients: (10,) of the measured minus predicted row in the right image, pixels.
+        hull_uv: (M, 2) convex polygon around the data of the fit, pixels; points outside get the value at the nearest
+            point of the polygon, because polynomials diverge.
         size_wh: width and height of the rig's images.
         K_left, K_right: (3, 3) intrinsics of the rig, pixels.
         T_right_cam: (4, 4) left to right camera, metres.
         provenance: where the field came from and how well it fitted; kept in the file, not used.
-        covariance: (10, 10), of the coefficients, pixels^2: how well they are known. 0: exactly.
+        covariance: (10, 10) covariance of the coefficients, pixels^2; 0 where they are known exactly.
     """
 
     coefficients: Tensor
@@ -126,7 +127,7 @@ class DisparityField:
         K_right: Tensor,  # (3, 3)
         T_right_cam: Tensor,  # (4, 4)
     ) -> DisparityField:
-        """The same bias at every pixel.
+        """A field with one bias at every pixel.
 
         Examples:
             >>> K, T = torch.eye(3), torch.eye(4)
@@ -150,7 +151,7 @@ class DisparityField:
         self,
         uv_left: Tensor,  # (*, 2) pixels of the full-resolution left image
     ) -> Tensor:  # (*,)
-        """Measured minus true disparity, pixels, in the dtype of `uv_left`; beyond the hull that of its border."""
+        """Measured minus true disparity, pixels, in the dtype of `uv_left`; beyond the hull, as at its border."""
         return self.offsets(uv_left)[0]
 
     @in_full_precision
@@ -158,7 +159,7 @@ class DisparityField:
         self,
         uv_left: Tensor,  # (*, 2) pixels of the full-resolution left image
     ) -> tuple[Tensor, Tensor]:  # (*,), (*,)
-        """`bias`, and measured minus predicted row in the right image; beyond the hull those of its border, pixels."""
+        """`bias`, and measured minus predicted row in the right image, pixels; beyond the hull, as at its border."""
         sizes = uv_left.shape[:-1] if isinstance(uv_left, Tensor) and not uv_left.is_nested else ()
         check_shape("uv_left", uv_left, (*sizes, 2), kind="floating")
         inside = nearest_in_convex_polygon(uv_left, self.hull_uv.to(uv_left))
@@ -172,7 +173,7 @@ class DisparityField:
         self,
         uv_left: Tensor,  # (*, 2) pixels of the full-resolution left image
     ) -> Tensor:  # (*,)
-        """Standard deviation of `bias`, pixels; beyond the hull it grows, for nobody has looked there."""
+        """Standard deviation of `bias`, pixels; it grows beyond the hull, where the fit has no data."""
         basis = polynomial_basis(uv_left, self.size_wh)
         return ((basis @ self.covariance.to(basis)) * basis).sum(dim=-1).clamp_min(0).sqrt()
 
@@ -199,7 +200,7 @@ class DisparityField:
             ("rotation", self.T_right_cam[:3, :3], T_right_cam[:3, :3], _TOLERANCE_ROTATION, "rad"),
         ):
             difference = float((mine.detach().double().cpu() - other.detach().double().cpu()).abs().max())
-            # `not <=` so that a calibration with NaN is refused too.
+            # `not <=` refuses a calibration with NaN, too.
             if not difference <= tolerance:
                 came = f"a difference of {difference:.4g} {unit}"
                 raise InputError("disparity_field", f"the rig's {name} to {tolerance} {unit}", came, cure)

@@ -1,4 +1,4 @@
-"""Ground planes of frames."""
+"""This module holds the ground planes of frames."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from directshape_torch.numerics.records import Dense, TensorRecord
 
 @dataclass(frozen=True)
 class GroundPlane(TensorRecord):
-    """One ground plane a frame: `normal . x_cam + offset = 0`, unit normal pointing up (negative y).
+    """A `GroundPlane` is one plane a frame: `normal . x_cam + offset = 0`, unit normal pointing up (negative y).
 
     Attributes:
         normal: (F, 3).
-        offset: (F,), metres; the height of the camera above the ground, negative where the plane is that of a hill
-            above it. NaN: cars of that frame fail.
+        offset: (F,) height of the camera above the plane, metres; negative where the plane is a hill above the camera.
+            NaN makes the cars of its frame fail.
         source: where each plane came from, F entries: "file", "stereo", "camera_height", or the caller's own word.
     """
 
@@ -33,7 +33,7 @@ class GroundPlane(TensorRecord):
         check_words("source", self.source, len(self.normal), "entries")
         downwards = self.normal[:, 1] >= 0
         not_unit = (self.normal.norm(dim=-1) - 1).abs() > 1e-3
-        # One wait for the device for both of them. NaN passes: it fails the cars of its own frame.
+        # One wait for the device serves both checks. NaN passes here, and fails the cars of its own frame.
         if bool((downwards | not_unit).any()):
             check_rows("normal", downwards, self.normal, "a normal pointing up (negative y)", "flip the plane's signs")
             check_rows("normal", not_unit, self.normal, "unit length", "divide the plane by its length")

@@ -1,4 +1,4 @@
-"""Boxes in images: how far they overlap, and those around projected 3D boxes."""
+"""This module measures how far boxes in images overlap, and finds the boxes around projected 3D boxes."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def box_outlines(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # (B, 24, 2), (B, 24, 2)
     """The ends of the edges of 3D boxes in the left and the right image, pixels; NaN for edges that are out of sight.
 
-    The right one goes through the residual disparity field of the rig, if there is one. What is behind the camera is
-    cut away 0.5 m in front of it.
+    Right pixels include the residual disparity of the rig, if it has a field. Edges are cut off 0.5 m in front of the
+    camera.
     """
     points_cam = _visible_edge_ends(box_corners(T_cam_obj.double(), dimensions_hwl.double()))
     in_front = ~points_cam.isnan().any(dim=-1)

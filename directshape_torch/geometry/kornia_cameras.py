@@ -1,4 +1,4 @@
-"""Rectified pairs of kornia's cameras."""
+"""This module makes stereo cameras of rectified pairs of kornia's cameras."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from directshape_torch.geometry.se3 import from_rotation_translation
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.numerics.checks import check_rotation, check_shape
 
-# Of rectified cameras: 1e-4 radians move a pixel by 0.07 at a focal length of 700, and KITTI's stand askew by 0.5 %.
+# Rectified cameras are turned by less: 1e-4 radians move a pixel by 0.07 at a focal length of 700.
 _LARGEST_TURN = 1e-4
-_LARGEST_OFFSET = 0.05  # of the baseline
+# Rectified cameras are displaced in height or depth by less than this share of the baseline; KITTI's are by 0.5 %.
+_LARGEST_OFFSET = 0.05
 
 
 def stereo_camera_of(
@@ -64,7 +65,7 @@ def _check_alike(left: kornia_camera.PinholeCamera, right: kornia_camera.Pinhole
 
 
 def _between_rectified(left: kornia_camera.PinholeCamera, right: kornia_camera.PinholeCamera) -> Tensor:
-    """`T_right_cam` (F, 4, 4), in float64 on the way: their world may be far away."""
+    """`T_right_cam` (F, 4, 4), computed in float64, because the cameras may be far from the origin of their world."""
     R = right.rotation_matrix.double() @ left.rotation_matrix.double().mT
     t = (right.translation_vector.double() - R @ left.translation_vector.double())[..., 0]
     turn = (R - torch.eye(3).to(R)).detach().abs().amax(dim=(1, 2))

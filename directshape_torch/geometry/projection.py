@@ -1,4 +1,4 @@
-"""Between points, rays, or left pixels of known depth or disparity, and the pixels of a rectified stereo pair.
+"""This module maps points, rays, depths and disparities to the pixels of a rectified stereo pair and back.
 
 Pixel centres lie at integer (u, v). Where a rig has a residual disparity field an image point lies at `u_right =
 pinhole - bias`, `v_right = pinhole + vertical`.
@@ -49,7 +49,7 @@ def project(
 
 
 class RightPixels(NamedTuple):
-    """Where left pixels of known depth appear in the right image."""
+    """`RightPixels` say where left pixels of known depth appear in the right image."""
 
     uv_right: Tensor  # (*, 2) pixels
     J_pixel_depth: Tensor  # (*, 2) d uv_right / d depth, pixels per metre
@@ -90,7 +90,7 @@ def warp_to_right(
 
 
 class RightRays(NamedTuple):
-    """Rays of the right camera in the left camera frame: `point_cam = origin_cam + depth_right * direction_cam`."""
+    """Points of right rays, in the left camera frame, are `point_cam = origin_cam + depth_right * direction_cam`."""
 
     origin_cam: Tensor  # (*, 3) metres
     direction_cam: Tensor  # (*, 3) unit depth in the right camera
@@ -102,9 +102,9 @@ def right_rays(
     K_right: Tensor,  # (*, 3, 3)
     T_right_cam: Tensor,  # (*, 4, 4)
     bias_px: Tensor | None = None,  # (*,) residual disparity at the corresponding left pixel
-    vertical_px: Tensor | None = None,  # (*,) residual row offset there
+    vertical_px: Tensor | None = None,  # (*,) residual row offset at the corresponding left pixel
 ) -> RightRays:
-    """Rays of right-image pixels, in the left camera frame; the inverse of the crossing done by `warp_to_right`.
+    """Rays of right-image pixels in the left camera frame; this is the inverse of `warp_to_right`.
 
     Examples:
         >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
@@ -120,7 +120,7 @@ def right_rays(
     R_cam_right = T_right_cam[..., :3, :3].transpose(-1, -2)
     ray_right = rays_from_pixels(uv_right, K_right)
     direction = (R_cam_right @ ray_right[..., None])[..., 0]
-    # `0.0 -` rather than unary minus, which would give negative zeros for a pure baseline.
+    # Unary minus instead of `0.0 -` would give negative zeros for a pure baseline.
     origin = 0.0 - (R_cam_right @ T_right_cam[..., :3, 3:])[..., 0]
     return RightRays(origin.expand_as(direction), direction)
 
@@ -156,11 +156,11 @@ def depth_from_disparity(
     T_right_cam: Tensor,  # (*, 4, 4)
     field: DisparityField | None = None,
 ) -> Tensor:  # (*,)
-    """Depth along the left camera's axis, metres; NaN where the disparity is not that of a point in front.
+    """Depth along the left camera's axis, metres; NaN where no point in front has the disparity.
 
     `u_right = (z a_0 + b_0) / (z a_2 + b_2)` with `a = K_right R K_left^-1 [u, v, 1]`, `b = K_right t` is solved for z,
-    so a right camera with another principal point, a shift in depth or a rotation is exact. With a field the disparity
-    is first freed of the rig's bias.
+    so the depth is exact for a right camera with another principal point, a shift in depth or a rotation. The bias of a
+    field is taken off the disparity first.
 
     Examples:
         >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])

@@ -1,9 +1,9 @@
-"""Rigid motions as matrices (*, 4, 4), and kornia's `Se3` from and to them.
+"""This module holds rigid motions as matrices (*, 4, 4), and converts them to kornia's `Se3` and back.
 
 Twists are `(v, omega)`: metres, then radians, as in the paper's supplement (generators `G_0 .. G_5`) and in kornia.
 All functions broadcast over leading dimensions, keep dtype and device, and have finite values and gradients
-at the identity and near a rotation by pi. What a solver's step needs is here; logarithm and adjoint are kornia's,
-`to_kornia(T).log()`.
+at the identity and near a rotation by pi. The module has what a solver's step needs; kornia has logarithm and adjoint,
+as in `to_kornia(T).log()`.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from directshape_torch.errors import InputError
 from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.numerics.tensors import made_once
 
-# Below this squared angle trigonometric ratios are replaced by Taylor series, whose first terms left out are then
-# below float64's rounding. Unlike the ratios they have finite derivatives of every order at zero.
+# Below this squared angle trigonometric ratios are replaced by Taylor series, whose first omitted terms are then below
+# float64's rounding. Unlike the ratios, the series have finite derivatives of every order at zero.
 _SERIES_ANGLE_SQUARED = 0.35
-# Coefficients of powers of -a^2, the highest first, of (1 - cos a)/a^2 and (a - sin a)/a^3.
+# These are the coefficients of powers of -a^2, the highest first, in (1 - cos a)/a^2 and (a - sin a)/a^3.
 _EXP_SERIES = tuple((1 / math.factorial(2 * n + 2), 1 / math.factorial(2 * n + 3)) for n in range(6, -1, -1))
 
 
@@ -32,12 +32,12 @@ def generators(dtype: torch.dtype = torch.float64, device: torch.device | str | 
 
 
 class _ExpConstants(NamedTuple):
-    """The tensors that `exp` combines a twist with."""
+    """`_ExpConstants` are the tensors that `exp` combines a twist with."""
 
-    part: Tensor  # (16,) of a twist that is, but for its sign, each entry of its matrix
-    sign: Tensor  # (16,)
+    part: Tensor  # (16,) index of the twist's component that each entry of the matrix is, up to its sign
+    sign: Tensor  # (16,) sign of each entry
     identity: Tensor  # (4, 4)
-    series: tuple[Tensor, ...]  # (2,) each
+    series: tuple[Tensor, ...]  # (2,) each, coefficients of the Taylor series
 
 
 @made_once
@@ -69,8 +69,8 @@ def exp(twist: Tensor, max_angle: float = math.inf) -> Tensor:
 
     Args:
         twist: :math:`(*, 6)`, `(v, omega)` in metres and radians.
-        max_angle: no rotation is larger, radians. Where it is below 0.59 there are fewer operations, and a larger
-            rotation would be wrong by its angle to the 16th power over 16!.
+        max_angle: bound of all rotations, radians. A bound below 0.59 saves operations, and a larger rotation would
+            then be wrong by its angle to the 16th power over 16!.
 
     Returns:
         Rigid transforms :math:`(*, 4, 4)`.
@@ -130,11 +130,11 @@ def transform(T_b_a: Tensor, points_a: Tensor) -> Tensor:
 def from_kornia(motion: Se3) -> Tensor:
     """Rigid transforms :math:`(*, 4, 4)` of kornia's `Se3`, say for `Detections.T_cam_obj`; metres.
 
-    Differentiable. An `Se3` made of plain tensors holds parameters, and then its matrix asks for a gradient: detach it
-    where none is wanted.
+    The result is differentiable. An `Se3` made of plain tensors holds parameters, and then its matrix asks for a
+    gradient: detach it where none is wanted.
 
     Raises:
-        InputError: not an `Se3`.
+        InputError: the motion is no `Se3`.
 
     Examples:
         >>> from_kornia(Se3.trans_z(torch.tensor([20.0])))[0, :3, 3].detach()
@@ -152,7 +152,7 @@ def to_kornia(T: Tensor) -> Se3:
     Gradients flow through it to `T`; where `T` asks for none, neither do the parameters of the `Se3`.
 
     Raises:
-        InputError: not :math:`(*, 4, 4)`.
+        InputError: the shape is not :math:`(*, 4, 4)`.
 
     Examples:
         >>> T = exp(torch.tensor([[1.0, -2.0, 0.5, 0.1, 0.2, -0.3]]))
@@ -161,5 +161,5 @@ def to_kornia(T: Tensor) -> Se3:
     """
     if T.shape[-2:] != (4, 4):
         raise InputError("T", "shape (*, 4, 4)", f"{tuple(T.shape)}", "build it with from_rotation_translation")
-    # A copy: the parameters of the `Se3` may be moved and trained.
+    # The matrix is copied, because the parameters of the `Se3` may be moved and trained.
     return Se3.from_matrix(T.clone()).requires_grad_(False)

@@ -1,4 +1,4 @@
-"""`StereoCamera`: calibration of rectified pairs, from intrinsics, projections or kornia's cameras."""
+"""`StereoCamera` holds the calibration of rectified pairs, from intrinsics, projections or kornia's cameras."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StereoCamera(TensorRecord):
-    """Calibration of the F rectified stereo frames of a call.
+    """A `StereoCamera` is the calibration of the F rectified stereo frames of a call.
 
     Attributes:
         K_left: intrinsics of the left camera, (F, 3, 3), pixels.
@@ -40,12 +40,12 @@ class StereoCamera(TensorRecord):
         T_right_cam: left camera to right camera, (F, 4, 4), metres. Any rigid transform: KITTI's right camera is also
             2.7 mm off vertically.
         t_cam_ref: `x_cam = x_ref + t_cam_ref`, (F, 3): `ref` is the frame of labels and result files (KITTI: rectified
-            camera 0). Zero where there is no such frame.
+            camera 0). It is zero where `ref` is the left camera frame.
         disparity_field: residual disparity of the rig (measured minus true), or None.
 
     Raises:
-        InputError: wrong shapes, numbers that are not finite, a rotation that is none, or a right camera that is not
-            to the right of the left one.
+        InputError: wrong shapes, numbers that are not finite, a matrix that is no rotation, or a right camera that is
+            not to the right of the left one.
     """
 
     K_left: Annotated[Tensor, Dense("F", 3, 3)]
@@ -72,19 +72,19 @@ class StereoCamera(TensorRecord):
     def from_intrinsics(
         cls,
         K: Given,  # (3, 3) or (F, 3, 3)
-        baseline_m: float | Given,  # or (F,)
+        baseline_m: float | Given,  # a number or (F,)
         K_right: Given | None = None,
         disparity_field: DisparityField | None = None,
     ) -> StereoCamera:
         """An ideal rectified pair: parallel cameras side by side, and labels in the frame of the left one.
 
-        The camera is float64 where K is, as arrays are, else float32; `FrameBatch.from_images` takes it to the dtype of
-        its images.
+        The camera is float64 where K is, as arrays mostly are, else float32; `FrameBatch.from_images` converts it to
+        the dtype of its images.
 
         Args:
             K: intrinsics of the images, pixels; one matrix for one frame, or one for each of F frames.
             baseline_m: distance of the two cameras, metres, positive.
-            K_right: of the right images where they differ.
+            K_right: intrinsics of the right images where they differ.
             disparity_field: residual disparity of the rig (measured minus true), or None.
 
         Raises:
@@ -116,16 +116,16 @@ class StereoCamera(TensorRecord):
     def from_projections(
         cls,
         P_left: Given,  # (3, 4) or (F, 3, 4)
-        P_right: Given,  # of the same shape
+        P_right: Given,  # (3, 4) or (F, 3, 4)
         disparity_field: DisparityField | None = None,
     ) -> StereoCamera:
         """The rectified pair of two projections: P2 and P3 of KITTI, P of both `camera_info` of ROS, P1 and P2 of
         OpenCV's `stereoRectify`.
 
         `K = P[:, :3]`, `t_left = K^-1 P_left[:, 3]`, `T_right_cam = [I, t_right - t_left]`: the baseline of an ideal
-        pair is `-P_right[0, 3] / P_right[0, 0]`. The matrix K of a `camera_info` is that of the raw images.
+        pair is `-P_right[0, 3] / P_right[0, 0]`. The matrix K of a `camera_info` belongs to the raw images.
 
-        The camera has the dtype of `P_left`, as with `from_intrinsics`.
+        The camera is float64 where `P_left` is, else float32.
 
         Raises:
             InputError: wrong shapes or types, a K that has no inverse, or a right camera that is not to the right of
@@ -167,20 +167,21 @@ class StereoCamera(TensorRecord):
     ) -> StereoCamera:
         """The rectified pair of kornia's `PinholeCamera`, or of its `StereoCamera`, of F frames each.
 
-        Pixels and axes are the same there: centres at integers, x right, y down, z forward. Extrinsics (world to
-        camera) and projections are taken to be in metres. Of a pair, `T_right_cam` is kept and the world is not: `ref`
-        is the left camera itself. The height and width of the images belong to `FrameBatch.sizes`. Dtype, device and
+        kornia has the same pixels and axes: centres at integers, x right, y down, z forward. Extrinsics (world to
+        camera) and projections are taken to be in metres. A pair keeps `T_right_cam` but no world: `ref` is the left
+        camera itself. The height and width of the images belong to `FrameBatch.sizes`. Dtype, device and
         gradients are kept.
 
         Args:
-            left: of the left images: a `StereoCamera`, which has both, or intrinsics and extrinsics (F, 4, 4).
-            right: likewise of the right images; None beside a `StereoCamera`.
+            left: a `StereoCamera`, which has both cameras, or the camera of the left images, with intrinsics and
+                extrinsics (F, 4, 4).
+            right: the camera of the right images; None with a `StereoCamera`.
             disparity_field: residual disparity of the rig (measured minus true), or None.
 
         Raises:
-            InputError: other types, a pair whose batch, image size, dtype or device differ, a rotation that is none,
-                cameras that are not rectified (turned by more than 1e-4 radians, or displaced by more than 5 % of the
-                baseline in height or depth), or a right camera that is not to the right of the left one.
+            InputError: other types, a pair whose batch, image size, dtype or device differ, a matrix that is no
+                rotation, cameras that are not rectified (turned by more than 1e-4 radians, or displaced by more than
+                5 % of the baseline in height or depth), or a right camera that is not to the right of the left one.
 
         Examples:
             >>> K, T_right_cam = torch.eye(4)[None], torch.eye(4)[None].clone()
@@ -209,9 +210,9 @@ class StereoCamera(TensorRecord):
     @torch.no_grad()
     @in_full_precision
     def field_sigma_px(self, frame_index: Tensor, points_cam: Tensor) -> Tensor:
-        """Standard deviation (P,) of the disparity field where points (P, 3) of frames (P,) are seen; 0 without one.
+        """Standard deviation (P,) of the disparity field where points (P, 3) of frames (P,) are seen; 0 without it.
 
-        Of points beyond the image it is that at the border: a polynomial knows nothing there.
+        Points beyond the image get the value at the border, because the polynomial has no data outside.
         """
         if self.disparity_field is None:
             return torch.zeros_like(points_cam[:, 0])
@@ -222,7 +223,7 @@ class StereoCamera(TensorRecord):
 
     @property
     def T_cam_ref(self) -> Tensor:
-        """The frame of labels and result files to the left camera, (F, 4, 4)."""
+        """The motion from the frame of labels and result files to the left camera, (F, 4, 4)."""
         return from_rotation_translation(torch.eye(3).to(self.t_cam_ref).expand_as(self.K_left), self.t_cam_ref)
 
 
