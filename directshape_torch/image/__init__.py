@@ -1,1 +1,1 @@
-"""Image operations: grey levels, gradients, pyramid, bilinear lookup."""
+"""This package holds image operations: grey levels, gradients, pyramid, bilinear lookup."""

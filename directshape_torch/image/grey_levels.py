@@ -1,4 +1,4 @@
-"""Grey levels of images, their gradients where something is to be seen, and their pyramid of exact 2x2 means."""
+"""This module computes grey levels of images, their gradients in chosen parts, and a pyramid of exact 2x2 means."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.tensors import take
 
-# Of red, green and blue in a grey level of 0..255 (ITU-R BT.601).
+# These are the weights of red, green and blue in a grey level of 0..255 (ITU-R BT.601).
 _WEIGHTS = (255 * 0.299, 255 * 0.587, 255 * 0.114)
 
 
@@ -27,7 +27,7 @@ def grey_levels(
         raise InputError("images", "shape (*, 3, H, W)", f"{tuple(images.shape)}", "put the colour axis there")
     if not images.is_floating_point():
         raise InputError("images", "floating point in [0, 1]", str(images.dtype), "divide by 255")
-    # Not kornia's: what needs new memory for each sum takes twice as long where whole images are summed.
+    # kornia's function needs new memory for each sum, which takes twice as long on whole images.
     (red, green, blue), (of_red, of_green, of_blue) = images.unbind(-3), _WEIGHTS
     return (red * of_red).add_(green, alpha=of_green).add_(blue, alpha=of_blue)
 
@@ -38,8 +38,8 @@ def length_2d(
 ) -> Tensor:
     """Euclidean length (*,) of an image gradient; its derivative is 0 where the image is flat.
 
-    A length that is not finite has no derivative either: 0 and not NaN, which a product with the 0 of whoever does not
-    use it would spread over the image.
+    The derivative is also 0 where the length is not finite. A derivative of NaN, times the gradient 0 of an unused
+    pixel, would spread NaN over the image.
     """
     square = (d_u * d_u).add_(d_v * d_v)
     if not square.requires_grad:
@@ -58,11 +58,11 @@ def gradient_magnitude_of_part(
 ) -> Tensor:
     """Length of the image gradient in a part (u0, v0, u1, v1) of a frame, half open, not empty, by central differences.
 
-    `size_hw` is the frame without padding, at whose own edge the edge is replicated. In grey levels per pixel
-    (v1 - v0, u1 - u0); differentiable by the image.
+    `size_hw` is the frame without padding, at whose edge the edge is replicated. The result (v1 - v0, u1 - u0) is in
+    grey levels per pixel and differentiable by the image.
     """
     (u0, v0, u1, v1), (height, width) = part, size_hw
-    # One pixel more on each side, as far as there is one.
+    # The part is cut with one more pixel on each side where the frame has one.
     left, top, right, bottom = int(u0 > 0), int(v0 > 0), int(u1 < width), int(v1 < height)
     grey = grey_levels(image[:, v0 - top : v1 + bottom, u0 - left : u1 + right])
     if not left or not top or not right or not bottom:
@@ -78,10 +78,10 @@ def gradient_magnitude_at(
     frame_index: Tensor,  # (P,)
     uv: Tensor,  # (P, 2)
 ) -> Tensor:
-    """`gradient_magnitude_of_part` at single pixels (P,), the same numbers; differentiable by the images."""
+    """The values of `gradient_magnitude_of_part` at single pixels (P,), differentiable by the images."""
     last_v, last_u = (sizes - 1).index_select(0, frame_index).unbind(1)
     u, v = uv.unbind(1)
-    # To the right, to the left, below, above.
+    # The four neighbours are right, left, below and above.
     places_u = torch.stack([torch.minimum(u + 1, last_u), (u - 1).clamp_min(0), u, u])
     places_v = torch.stack([v, v, torch.minimum(v + 1, last_v), (v - 1).clamp_min(0)])
     channel = torch.arange(3, device=images.device)[:, None, None]
@@ -89,7 +89,7 @@ def gradient_magnitude_at(
         plane = frame_index * 3 + channel
         values = take(images.view(-1), (plane * images.shape[2] + places_v) * images.shape[3] + places_u)
     else:
-        # Without a copy of whole frames that lie in memory in another order.
+        # Indexing avoids a copy of whole frames where they lie in memory in another order.
         values = images[frame_index, channel, places_v, places_u]
     right, left, below, above = grey_levels(values).unbind(0)
     return length_2d(right - left, below - above).mul_(0.5)
@@ -123,7 +123,7 @@ def halve_sizes(
 
 @dataclass(frozen=True)
 class GreyPair:
-    """Grey levels of both images at one pyramid level."""
+    """A `GreyPair` holds the grey levels of both images at one pyramid level."""
 
     left: Tensor  # (F, H, W)
     right: Tensor  # (F, H, W)
@@ -131,6 +131,6 @@ class GreyPair:
     scale: float  # level pixels per full-resolution pixel
 
     def halved(self) -> GreyPair:
-        """The next coarser level."""
+        """The pair at the next coarser level."""
         left, right = (halve(image[:, None])[:, 0] for image in (self.left, self.right))
         return GreyPair(left, right, halve_sizes(self.sizes), 0.5 * self.scale)

@@ -1,4 +1,4 @@
-"""Bilinear lookup in images, with the exact derivative of that lookup."""
+"""This module looks values up bilinearly in images, with the exact derivative of the lookup."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from directshape_torch.numerics.tensors import not_negative, take
 
 
 class BilinearPatch(NamedTuple):
-    """A lookup with its derivatives by the two coordinates."""
+    """A `BilinearPatch` is a lookup with its derivatives by the two coordinates."""
 
     value: Tensor  # (...)
     d_u: Tensor  # (...) per pixel
     d_v: Tensor  # (...) per pixel
-    inside: Tensor  # (...) bool: within the image, border pixels' centres included; NaN coordinates are not
+    inside: Tensor  # (...) bool: within the image, including centres of border pixels; false for NaN
 
 
 def bilinear_at(
     image: Tensor,  # (H, W)
     uv: Tensor,  # (..., 2) pixels (column, row)
 ) -> BilinearPatch:
-    """`bilinear_patch` in one image."""
+    """The lookup of `bilinear_patch` in one image."""
     height, width = image.shape
     first = torch.zeros((), dtype=torch.long, device=image.device)
     return bilinear_patch(image.reshape(-1), first, width, uv[..., 0], uv[..., 1], width - 1, height - 1)
@@ -31,18 +31,19 @@ def bilinear_at(
 
 def bilinear_patch(
     pixels: Tensor,  # (A,) of images behind one another
-    first_pixel: Tensor,  # broadcastable to (...): of the image of each point
+    first_pixel: Tensor,  # broadcastable to (...): index of the first pixel of each point's image
     row_step: Tensor | int,  # pixels from one row to the next
     u: Tensor,  # (...)
     v: Tensor,  # (...)
-    last_column: Tensor | int,  # broadcastable to (...): of the image of each point
-    last_row: Tensor | int,
+    last_column: Tensor | int,  # broadcastable to (...): last column of each point's image
+    last_row: Tensor | int,  # broadcastable to (...): last row of each point's image
 ) -> BilinearPatch:
     """Value at (u, v), (0, 0) being the centre of the top-left pixel, and the exact derivative of the bilinear patch.
 
     The gradient belongs to the cell right and below of a point that lies on a grid line (left and above on the last
     row and column). A coordinate outside the image is clamped to it, where the lookup is constant in that coordinate:
-    its derivative is 0. Differentiable by autograd in pixels and coordinates; autograd and the returned gradient agree.
+    its derivative is 0. Autograd differentiates the value by pixels and coordinates, and agrees with the returned
+    gradient.
     """
     u, inside_u, column, right = _cell(u, last_column)
     v, inside_v, row, below = _cell(v, last_row)
@@ -61,11 +62,11 @@ def _cell(
     coordinate: Tensor,  # (...)
     last: Tensor | int,  # broadcastable to (...)
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Fraction within the cell, whether inside, first index of the cell, step to its second (0 where there is none)."""
-    # A number from the host would be waited for.
+    """Fraction within the cell, whether inside, first index of the cell, step to its second index (0 without one)."""
+    # A copy of a number from the host would make the device wait.
     last = last.int() if isinstance(last, Tensor) else coordinate.new_full((), last, dtype=torch.int32)
-    # Not a choice by `inside`, which takes four times as long; not `minimum`, which halves derivatives on the last row;
-    # NaN must not become an index.
+    # A choice by `inside` would take four times as long, `minimum` would halve derivatives on the last row, and NaN
+    # must not become an index.
     clamped = not_negative(coordinate).clamp_max(last)
     index = clamped.detach().int().minimum((last - 1).clamp_min(0))
     return clamped - index, clamped == coordinate, index, last.clamp(max=1)
