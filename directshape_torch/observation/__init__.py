@@ -1,1 +1,1 @@
-"""What the images say about each car: its region, its pixels, and which of them other instances hide."""
+"""This package gathers what the images say about each car: its region, its pixels, and what hides them."""

@@ -1,10 +1,10 @@
-"""Which pixels of a car are hidden by instances in front of it (paper, section "Occlusion Handling").
+"""This module finds pixels of a car that instances in front of it hide (paper, section "Occlusion Handling").
 
-Occluders of a car are all instances of the same frame that stand in front of it and have a mask on that side: the
-other detections, and `Detections.occluders` of any class. An occluder hides where its probability exceeds 0.5.
+Occluders of a car are all instances of the same frame that stand in front of it and have a mask in the image: the
+other detections, and `Detections.occluders` of any class. An occluder hides pixels where its probability exceeds 0.5.
 
-What decides is a number: an instance is in front of a car where its own is less. So one image a frame, of the least
-number of the instances that cover each pixel, tells of every car what hides it.
+Each instance has a number, and is in front of a car where its number is less than the car's. One image a frame, with
+the least number of the instances that cover each pixel, therefore tells what hides every car.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ OcclusionOrder = Literal["depth", "box_bottom"]
 
 
 def occlusion_map(detections: Detections, side: Side, order: OcclusionOrder = "depth") -> OcclusionMap:
-    """What hides the B objects in one image.
+    """The map of what hides the B objects in one image.
 
     Args:
         detections: B objects and M further occluders.
         side: image whose masks are used.
-        order: "depth": smaller depth of the object's origin; an instance of unknown depth (NaN, or not in front of the
-            camera) goes by the boxes. "box_bottom": lower bottom edge of the left 2D box, as in the paper. Equals, and
-            comparisons with NaN, hide nothing.
+        order: "depth": the instance whose origin has the smaller depth is in front; an instance of unknown depth (NaN,
+            or not in front of the camera) is ordered by its box. "box_bottom": the instance with the lower bottom edge
+            of the left 2D box is in front, as in the paper. Equal numbers and NaN hide nothing.
 
     Raises:
         InputError: unknown side or order.
@@ -56,11 +56,11 @@ def occlusion_map(detections: Detections, side: Side, order: OcclusionOrder = "d
     )
     width, height, frames = right - left, bottom - top, frame.tolist()
     num_frames = max(frames, default=-1) + 1
-    # One entry at least, for whoever looks up nothing.
+    # There is at least one entry, because pixels outside of all masks look up entry 0.
     covering = numbers.new_full((max(1, num_frames * height * width), 2), torch.inf)
     images = covering[: num_frames * height * width].view(num_frames, height, width, 2)
     instances = zip(numbers.tolist(), frames, boxes, crops, strict=True)
-    # Painted from behind, so that the foremost stays; an instance has a number of one kind, or none.
+    # Instances are painted from back to front, so that the foremost stays. Each has a number of one kind, or none.
     for of_kinds, at, (u0, v0, u1, v1), crop in sorted(instances, key=lambda instance: instance[0], reverse=True):
         covers = crop > MASK_THRESHOLD
         for kind, number in enumerate(of_kinds):
@@ -73,7 +73,7 @@ def occlusion_map(detections: Detections, side: Side, order: OcclusionOrder = "d
 
 
 def _instances(detections: Detections, order: str) -> tuple[Tensor, Tensor, Tensor]:
-    """Frame and numbers (B + M, 2) of all instances; below which (B, 2) they are in front of the detections."""
+    """Frames and numbers (B + M, 2) of all instances, and limits (B, 2) below which they are in front of detections."""
     if order not in ("depth", "box_bottom"):
         raise InputError("order", "'depth' or 'box_bottom'", repr(order))
     d, others = detections, detections.occluders
@@ -83,7 +83,7 @@ def _instances(detections: Detections, order: str) -> tuple[Tensor, Tensor, Tens
         frame = torch.cat([frame, others.frame_index])
         depth_m = torch.cat([depth_m, others.depth_m.to(depth_m)])
         bottom_v = torch.cat([bottom_v, others.bottom_v.to(bottom_v)])
-    # What stands in front of what has no derivative.
+    # The order of instances has no derivative.
     limits, depth_m, bottom_v = limits.detach(), depth_m.detach(), bottom_v.detach()
     by_depth = (depth_m > 0) & (order == "depth")  # False for NaN
     numbers = torch.where(

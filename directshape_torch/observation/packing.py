@@ -1,8 +1,8 @@
-"""Packed pixels of all cars: the one place where observations are gathered for the residuals.
+"""This module packs the pixels of all cars, and is the one place where observations are gathered for the residuals.
 
 Pixels are packed over cars and frames, sorted by object, because a near car has fifty times the pixels of a far one.
-Square cells fill a car's region, as many as pixels are wanted (paper, section "Adaptive Point Sampling", round 2). The
-mode "adaptive" takes the pixel of each cell at which the image changes most, "uniform" the one in its middle.
+Square cells fill a car's region, one for each wanted pixel (paper, section "Adaptive Point Sampling", round 2). The
+mode "adaptive" takes the pixel of each cell at which the image changes most, "uniform" the pixel in the middle.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from directshape_torch.observation.occlusion import occlusion_map
 from directshape_torch.rows import OcclusionMap, PixelSamples, PointSamples
 from directshape_torch.scene import SIDES, Detections, FrameBatch, Side
 
-# How far a region reaches beyond mask and box, on every side.
+# A region extends beyond mask and box, on every side, by the larger of this many pixels and this share of its size.
 _MARGIN_PX, _MARGIN_SHARE = 4.0, 0.1
 
 
 @dataclass(frozen=True)
 class Observation:
-    """Everything that B cars see of the images."""
+    """An `Observation` is everything that the images show of B cars."""
 
     left: PixelSamples  # packed pixels of the left image
-    right: PixelSamples  # and of the right one
-    # what hides cars in the right image, by row of the detections; None: not asked for
+    right: PixelSamples  # packed pixels of the right image
+    # what hides cars in the right image, by row of the detections; None where it is not asked for
     hidden_right: OcclusionMap | None
     mask_areas: Tensor  # (detections of the call, 2) foreground pixels of the left and right masks, 0 where absent
-    points: PointSamples | None = None  # of dense stereo, for the methods that use them
+    points: PointSamples | None = None  # points of dense stereo, for the methods that use them
 
     def of_objects(self, keep: Tensor) -> Observation:
-        """What the objects where `keep` (B,) holds see; occlusion and areas stay those of all detections."""
+        """The observation of the objects where `keep` (B,) holds; occlusion and areas still cover all detections."""
         points = None if self.points is None else self.points.of_objects(keep)
         return replace(self, left=self.left.of_objects(keep), right=self.right.of_objects(keep), points=points)
 
@@ -43,7 +43,7 @@ class Observation:
 def pack_pixels(frames: FrameBatch, detections: Detections, config: SamplingConfig) -> Observation:
     """Choose the pixels of every car in both images and gather what the residuals need of them.
 
-    The initial poses fix regions and the correspondence for the disparity field.
+    The initial poses fix the left pixels at which the disparity field is read for pixels of the right image.
     """
     regions = car_regions(frames, detections)
     hidden_left, hidden_right = (
@@ -70,7 +70,7 @@ def car_regions(frames: FrameBatch, d: Detections) -> tuple[Tensor, Tensor]:
     """Regions (B, 4) of the cars in the left and the right image, integer (u0, v0, u1, v1), half open."""
     sizes = frames.sizes[d.frame_index]
     left = region_boxes(d.box_2d, d.mask_left.extents, sizes)
-    # Only the left image has detection boxes. A side without a mask says nothing about the car: no pixels there.
+    # Only the left image has detection boxes. A side without a mask says nothing about the car and gets no pixels.
     right = region_boxes(torch.full_like(d.box_2d, torch.nan), d.mask_right.extents, sizes)
     return left * d.has_mask_left[:, None], right
 
@@ -80,11 +80,11 @@ def region_boxes(
     mask_boxes: Tensor,  # (B, 4)
     sizes: Tensor,  # (B, 2)
 ) -> Tensor:
-    """The region (B, 4) on one side whose pixels can speak about each car: integer, half open, 0 where nothing is left.
+    """The region (B, 4) of each car in one image: integer, half open, 0 where nothing is left.
 
-    The mask's box (all 0: none) joined with the given one (NaN, or outside of the image: none), grown on every side by
-    the larger of 4 px and a tenth of its width (or height) and clipped to the image, so that a shape that spills out of
-    its mask pays for it.
+    The region is the box around the mask (none if all 0) and the given box (none if NaN or outside of the image). It is
+    grown on every side by the larger of 4 px and a tenth of its width (or height) and clipped to the image, so that a
+    shape that extends beyond its mask has a cost.
     """
     last_uv = (sizes.flip(-1) - 1).to(boxes.dtype)
     in_mask = mask_boxes[:, 2] > mask_boxes[:, 0]
@@ -136,7 +136,7 @@ def _pack_side(
 
 
 def _of_pixels(values: Tensor, object_index: Tensor) -> Tensor:
-    """`values[object_index]` of a tensor (B, ...), in a third of the time."""
+    """The entries `values[object_index]` of a tensor (B, ...), in a third of the time."""
     return values.flatten(1).index_select(0, object_index).view(-1, *values.shape[1:])
 
 
@@ -151,7 +151,7 @@ def _rays_left(
 def _rays_right(
     frames: FrameBatch, detections: Detections, object_index: Tensor, uv: Tensor
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
-    """The corresponding left pixel is the one at the car's INPUT depth: frozen per car, so moving does not pay."""
+    """Rays of right pixels; offsets are read at the left pixels for the car's INPUT depth, so moving gains nothing."""
     camera, frame = frames.camera, detections.frame_index
     K_left, K_right, T_right_cam = camera.K_left[frame], camera.K_right[frame], camera.T_right_cam[frame]
     shift = K_left[:, 0, 0] * camera.baseline[frame] / detections.T_cam_obj[:, 2, 3]
@@ -170,7 +170,7 @@ def sampled_pixels(
     mode: SamplingMode,
     settings: SamplingConfig,
 ) -> tuple[Tensor, Tensor]:
-    """Pixels of B regions in one image side, hidden ones among them: object (P,) ascending and integer uv (P, 2).
+    """Pixels of B regions in one image, including hidden ones: objects (P,) in ascending order and integer uv (P, 2).
 
     Examples:
         >>> ramp = (torch.arange(40.0) / 40).square().expand(1, 3, 40, 40)
@@ -193,8 +193,8 @@ def cell_sides(
 ) -> Tensor:
     """Side of the cells of each region, (B, 1) float64, pixels: `sqrt(h w / n)` with `n = clip(density h w, min, max)`.
 
-    They are laid from the region's upper left corner and are never below one pixel, so a tiny region gives every pixel
-    it has. (The paper counts the detection's box; the region is used so that the density in it is the wanted one.)
+    Cells start at the region's upper left corner and are at least one pixel large, so a tiny region gives all its
+    pixels. (The paper uses the area of the detection's box; the region's area gives the region the wanted density.)
     """
     areas = (regions[:, 2:] - regions[:, :2]).double().prod(dim=1, keepdim=True)
     wanted = (settings.density * areas).clamp(settings.min_pixels, settings.max_pixels)
@@ -229,7 +229,7 @@ def _strongest_pixels(
     regions: Tensor,  # (B, 4)
     side: Tensor,  # (B, 1)
 ) -> tuple[Tensor, Tensor]:
-    """Of each cell the pixel of the largest gradient magnitude."""
+    """The pixel of the largest gradient magnitude in each cell."""
     cells = _cells(regions, side)
     sizes_hw, found = sizes.tolist(), [regions.new_zeros(0, 2)]
     places = zip(frame_index.tolist(), regions.tolist(), side[:, 0].tolist(), cells.tolist(), strict=True)
@@ -249,12 +249,12 @@ def _first_largest(
     columns: int,
     rows: int,
 ) -> Tensor:
-    """Of each cell the place (rows columns,) of the largest value, the first of equals; one that is not finite is 0."""
+    """The place (rows columns,) of the largest value in each cell, the first of equal ones; infinity and NaN are 0."""
     row, column = (
         (torch.arange(length, device=values.device, dtype=torch.float64) / side).long() for length in values.shape
     )
     cell = row[:, None] * columns + column
-    # The bits of such numbers are ordered as the numbers are. Among equals the place decides, counted from the end.
+    # Bits of numbers that are at least 0 have their order. Among equals the place decides, counted from the end.
     bits = values.float().nan_to_num(nan=0.0, posinf=0.0).view(torch.int32).long().flatten()
     from_end = torch.arange(len(bits) - 1, -1, -1, device=values.device)
     best = bits.new_zeros(rows * columns).scatter_reduce_(0, cell.flatten(), (bits << 32) + from_end, "amax")

@@ -1,4 +1,4 @@
-"""Which cars can be refined at all, and whether the parts of a call fit together."""
+"""This module tells which cars can be refined at all, and whether the parts of a call fit together."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from directshape_torch.scene import Detections, FrameBatch, Occluders
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.status import Status
 
-# A car whose origin is nearer than this is at the camera: its silhouette is not a projection any more.
+# A car whose origin is nearer than this is at the camera, and its silhouette is no projection.
 _MIN_DEPTH_M = 1.0
 _DTYPES = (torch.float32, torch.float64)
 
@@ -26,9 +26,10 @@ _DTYPES = (torch.float32, torch.float64)
 def check_no_tangents(frames: FrameBatch, detections: Detections, others: Iterable[Tensor]) -> None:
     """Raise `InputError` where some tensor of a call is a dual number of forward-mode differentiation.
 
-    What the iterations hold constant, they hold back from gradients; tangents would pass through it and come out wrong.
+    The iterations detach what they hold constant from gradients. Tangents would pass through it and come out wrong.
     """
-    # Of the whole process, other threads' regions too: what counts is whether these tensors take part.
+    # Forward mode is on for the whole process, also by regions of other threads. What counts is whether these tensors
+    # take part.
     if not is_forward_mode():
         return
     declared = [each.value for record in (frames, detections) for each in record.tensors("")]
@@ -45,13 +46,13 @@ def check_no_tangents(frames: FrameBatch, detections: Detections, others: Iterab
 
 def in_dtype_of(frames: FrameBatch, detections: Detections) -> Detections:
     """The detections in the dtype of the frames; raises `InputError` for other records, and for half precision."""
-    # By what they have and not by `isinstance`: a record of one's own will do.
+    # Records are checked by their members and not by `isinstance`, so that a user's own record will do.
     needed = ("frames", frames, FrameBatch, "images_left"), ("detections", detections, Detections, "mask_left")
     for name, given, kind, member in needed:
         if not hasattr(given, member):
             raise InputError(name, f"a {kind.__name__}", type(given).__name__, "call it as refiner(frames, detections)")
     if frames.images_left.dtype not in _DTYPES:
-        # A refiner in half precision would be asked for next: said before dtypes are compared.
+        # This comes before the comparison of dtypes, whose message would ask for a refiner in half precision.
         raise InputError(
             "frames",
             "float32 or float64",
@@ -82,7 +83,7 @@ def check_fit(frames: FrameBatch, detections: Detections, prior: ShapePrior) -> 
 
 
 def _check_masks(name: str, instances: Detections | Occluders, frames: FrameBatch) -> None:
-    """Raise `InputError` unless masks are those of frames of the call."""
+    """Raise `InputError` unless masks have the image size and the frame numbers of the call."""
     if not len(instances.frame_index):
         return
     size_hw = tuple(frames.images_left.shape[2:])
@@ -108,7 +109,7 @@ def _check_times(detections: Detections, frames: FrameBatch) -> None:
 
 
 def refusals(frames: FrameBatch, detections: Detections, seen: Observation, config: RefinerConfig) -> Tensor:
-    """For each car the code (B,) of the status that forbids its refinement, or -1, from what all cars see."""
+    """The code (B,) of the status that forbids the refinement of each car, or -1."""
     T = detections.T_cam_obj
     finite = T.isfinite().all(-1).all(-1)
     upright = (T[:, :3, 1] * frames.ground.normal[detections.frame_index]).sum(-1) < 0
@@ -118,7 +119,7 @@ def refusals(frames: FrameBatch, detections: Detections, seen: Observation, conf
     else:
         lacking = _lacking_pixels(seen, config.sampling.min_usable_pixels)
     code = torch.full((len(detections),), -1, device=T.device)
-    # Later ones say more.
+    # Later statuses say more, so they replace earlier ones.
     for condition, status in (*lacking, (~in_front, Status.behind_camera), (~finite, Status.non_finite)):
         code = torch.where(condition, torch.full_like(code, status.code), code)
     return code
@@ -129,5 +130,5 @@ def _lacking_pixels(pixels: Observation, least: int) -> list[tuple[Tensor, Statu
     left, right = (occurrences(x.object_index, len(areas)) for x in (pixels.left, pixels.right))
     # A region always has pixels, but masks that show next to nothing cannot tell a car from its surroundings.
     too_few = torch.minimum(left + right, areas.sum(dim=1)) < least
-    # The texture is compared from the left image to the right one: without a left mask nothing holds a car's depth.
+    # The texture of the left image is compared with the right one, so without a left mask nothing fixes a car's depth.
     return [(too_few, Status.too_few_pixels), (areas[:, 0] == 0, Status.no_mask)]
