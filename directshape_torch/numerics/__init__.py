@@ -1,1 +1,1 @@
-"""Small tools over PyTorch: constants on a device, gradient modes, full precision, checked shapes."""
+"""This package has small tools over PyTorch: constants on a device, gradient modes, full precision, checked shapes."""

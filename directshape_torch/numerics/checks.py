@@ -1,4 +1,4 @@
-"""Checks of arguments at the border of the package."""
+"""This module checks arguments at the border of the package."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from directshape_torch.errors import InputError, shown
 from directshape_torch.numerics.conversion import FLOATING
 
-# Calibration files have six digits or more, and float32 seven.
+# Rotations are right up to rounding: calibration files have six digits or more, and float32 has seven.
 _ROTATION_TOLERANCE = 1e-3
 _WIDEST_PX = 2**31
 
@@ -22,7 +22,7 @@ Kind = Literal["number", "floating", "image", "index", "flags", "mask"]
 FOLLOWING: frozenset[Kind] = frozenset({"floating", "image"})
 _INTEGERS = (torch.int32, torch.int64)
 _SMALL = (torch.uint8, torch.int8, torch.int16, torch.bool)
-# Dtypes, in words, and the cure. Bytes do not index: they would be taken for a mask.
+# Each kind has its dtypes, a name for them, and the cure. Bytes are no indices, for PyTorch would take them for a mask.
 _KINDS: dict[Kind, tuple[tuple[torch.dtype, ...], str, str]] = {
     "number": (FLOATING + _INTEGERS + _SMALL, "real numbers", ""),
     "floating": (FLOATING, "floating point", "convert it with .float() or .double()"),
@@ -42,11 +42,11 @@ def check_shape(
 ) -> None:
     """Raise `InputError` unless `tensor` is a dense tensor of the expected shape and kind, with numbers.
 
-    Letters stand for any size.
+    Letters in `expected` stand for any size.
     """
     wanted = "(" + ", ".join(str(n) for n in expected) + ("," if len(expected) == 1 else "") + ")"
     if not isinstance(tensor, Tensor):
-        # Arrays and lists come from whoever has just read a file.
+        # Arrays and lists mostly come from a file that was just read.
         made = cure if tensor is None else "make one with torch.as_tensor or torch.stack"
         raise InputError(name, f"a tensor of shape {wanted}", type(tensor).__name__, made)
     if tensor.is_nested or tensor.layout != torch.strided:
@@ -90,13 +90,13 @@ def check_size_wh(name: str, size: object) -> None:
 
 
 def check_type(name: str, value: object, kinds: tuple[type, ...]) -> None:
-    """Raise `InputError` unless `value` is of one of some types, the first of which is named."""
+    """Raise `InputError` unless `value` has one of the types, of which the message names the first."""
     if not isinstance(value, kinds):
         raise InputError(name, f"a {kinds[0].__name__}", type(value).__name__)
 
 
 def check_words(name: str, words: object, count: int, what: str) -> None:
-    """Raise `InputError` unless these are so many words, called `what`."""
+    """Raise `InputError` unless there are `count` words, which messages call `what`."""
     if not isinstance(words, (tuple, list)) or not all(isinstance(word, str) for word in words):
         raise InputError(name, f"a tuple of {count} {what}", type(words).__name__)
     if len(words) != count:

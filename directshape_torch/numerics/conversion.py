@@ -1,6 +1,6 @@
-"""What users have, arrays, lists and numbers of other dtypes, as the tensors that a call computes with.
+"""This module turns arrays, lists and numbers of other dtypes into the tensors that a call computes with.
 
-What is no such thing stays as it is: the check that follows names it.
+Other values stay as they are, and the check that follows names them.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Given = Tensor | NDArray[Any] | Sequence[Any]
-"""Numbers in a tensor, an array or a list."""
+"""Users give numbers in a tensor, an array or a list."""
 
 FLOATING = (torch.float32, torch.float64, torch.float16, torch.bfloat16)
 _WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32, torch.uint64)
@@ -29,12 +29,12 @@ def working_dtype(dtype: torch.dtype) -> torch.dtype:
 
 
 def as_tensor(values: Any) -> Tensor:
-    """An array or a list of numbers as a tensor, a copy; float64 where it holds Python's own numbers with a point."""
+    """An array or a list of numbers as a tensor, which is a copy; a list of Python's floats becomes float64."""
     if values is None or isinstance(values, (Tensor, str)):
         return values  # type: ignore[return-value]
     try:
         array = np.asarray(values)
-        # In the order and the bytes of this machine, and writable, as PyTorch wants it.
+        # PyTorch needs a writable array in the memory order and byte order of this machine.
         return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), order="C"))
     except (TypeError, ValueError, RuntimeError):
         return values  # type: ignore[no-any-return]
@@ -61,7 +61,7 @@ def as_index(values: Any, like: Tensor) -> Tensor:
 
 
 def as_number(value: Any) -> Any:
-    """The number in a tensor or an array without axes."""
+    """The number in a tensor or an array without axes; other values stay as they are."""
     is_one = isinstance(value, (Tensor, np.ndarray, np.generic)) and value.ndim == 0
     return value.item() if is_one and not getattr(value, "is_meta", False) else value
 

@@ -1,4 +1,4 @@
-"""Regions and functions in which products of matrices have all the digits of their inputs."""
+"""This module makes regions and functions in which products of matrices have all the digits of their inputs."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from directshape_torch.numerics.conversion import FLOATING, working_dtype
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
-# "none": nobody has asked for fewer digits.
+# "none" means that nobody has asked for fewer digits.
 _FULL = ("none", "ieee")
-# By this way of asking and not by names in `torch.backends`: it does not raise where old and new names were mixed.
+# PyTorch is asked about these backends by name, because `torch.backends` raises where old and new names were mixed.
 _BACKENDS = ("cuda", "mkldnn")
 
 
 class _Setting(NamedTuple):
-    """Which precisions of matrix products the user has allowed."""
+    """A `_Setting` says which precisions of matrix products the user has allowed."""
 
-    by_old_name: str | None  # of `torch.set_float32_matmul_precision`; None where the newer names are in use
-    asked: tuple[str, ...]  # of each backend
+    by_old_name: str | None  # value of `torch.set_float32_matmul_precision`; None where the newer names are in use
+    asked: tuple[str, ...]  # precision asked of each backend
 
     @classmethod
     def now(cls) -> _Setting:
@@ -38,7 +38,7 @@ class _Setting(NamedTuple):
         return cls(by_old_name, tuple(_asked(backend) for backend in _BACKENDS))
 
     def suspend(self) -> None:
-        """Allow nothing, by the names that the user uses."""
+        """Ask for all digits, by the names that the user uses."""
         if self.by_old_name not in (None, "highest"):
             torch.set_float32_matmul_precision("highest")
             return
@@ -53,7 +53,7 @@ class _Setting(NamedTuple):
             return
         for backend, value in zip(_BACKENDS, self.asked, strict=True):
             if value not in _FULL:
-                # As if nobody had asked: what then comes from `torch.backends.fp32_precision` goes on following it.
+                # "none" comes first, so that a value from `torch.backends.fp32_precision` goes on following it.
                 torch._C._set_fp32_precision_setter(backend, "matmul", "none")
                 if _asked(backend) != value:
                     torch._C._set_fp32_precision_setter(backend, "matmul", value)
@@ -65,7 +65,7 @@ def _asked(backend: str) -> str:
 
 @dataclass
 class _Regions:
-    """The regions of all threads: the setting is the process's; the first to come and the last to leave change it."""
+    """`_Regions` counts regions of all threads; the first entry and the last exit change the process's setting."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     inside: int = 0
@@ -90,9 +90,9 @@ _regions = _Regions()
 
 
 class _Thread(threading.local):
-    """What is known of the thread that asks."""
+    """`_Thread` holds what each thread knows about itself."""
 
-    is_inside = False  # of a region
+    is_inside = False  # whether the thread is inside a region
 
 
 _thread = _Thread()
@@ -109,12 +109,12 @@ def _no_autocast() -> Iterator[None]:
 
 @contextmanager
 def full_precision() -> Iterator[None]:
-    """No autocast, and no products of float32 with fewer digits, whatever the user has allowed.
+    """A region without autocast, in which products of float32 have all digits, whatever the user has allowed.
 
     Half precision cannot hold pixel coordinates, and TF32, which `torch.set_float32_matmul_precision("high")` allows
     on a graphics card, rounds a coordinate of 30 m to 2 cm. Autocast is switched off on CPU, CUDA, XPU and MPS. The
-    user's setting of TF32 is put back at the end. Other than autocast it belongs to the process: in the meantime the
-    products of its other threads are exact, too.
+    user's setting of TF32 is restored at the end. It belongs to the process, unlike autocast, so the products of other
+    threads are exact, too, in the meantime.
     """
     was_inside = _thread.is_inside
     _regions.enter()
@@ -128,11 +128,11 @@ def full_precision() -> Iterator[None]:
 
 
 def in_full_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Mark a function of tensors that users call: it is a region of `full_precision`, and knows one dtype.
+    """Mark a function of tensors that users call: it is a region of `full_precision`, and computes in one dtype.
 
-    That is the dtype of the first floating-point tensor among the arguments, which the others follow; half precision
-    becomes float32, in which the result is too. Within a region, where all of this has been done, a call costs less
-    than a microsecond.
+    The first floating-point tensor among the arguments gives the dtype, and the other tensors follow. Half precision
+    becomes float32, also in the result. Within a region, where all of this has been done, a call costs less than a
+    microsecond.
     """
 
     @wraps(function)
@@ -141,7 +141,7 @@ def in_full_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
             return function(*args, **kwargs)
         dtype = _dtype_of((*args, *kwargs.values()))
         named = {name: _of_dtype(value, dtype) for name, value in kwargs.items()}
-        # A compiler can trace autocast, and neither locks nor what belongs to the process.
+        # The compiler can trace autocast, but neither locks nor settings of the process.
         with _no_autocast() if torch.compiler.is_compiling() else full_precision():
             return function(*(_of_dtype(value, dtype) for value in args), **named)
 
@@ -149,7 +149,7 @@ def in_full_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def _dtype_of(values: tuple[object, ...]) -> torch.dtype:
-    """In which values are computed."""
+    """The dtype in which values are computed."""
     first = next((value.dtype for value in values if _is_floating(value)), torch.float32)
     return working_dtype(first)
 

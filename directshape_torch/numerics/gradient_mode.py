@@ -1,4 +1,4 @@
-"""Whether what is computed now can be differentiated, and whether it may be kept."""
+"""This module tells whether results computed now can be differentiated, and whether they may be kept."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ _R = TypeVar("_R")
 
 
 def nothing_is_differentiated() -> bool:
-    """Whether neither gradients nor a forward mode are on, nor one of `torch.func`, which enables either."""
+    """Whether gradients and forward mode are both off, which excludes the modes of `torch.func`."""
     return not (torch.is_grad_enabled() or is_forward_mode())
 
 
 def is_forward_mode() -> bool:
-    """Whether this is inside a region of forward-mode differentiation."""
+    """Whether the caller is inside a region of forward-mode differentiation."""
     return torch.autograd.forward_ad._current_level >= 0
 
 
 def is_within_transform() -> bool:
-    """Whether a transform of `torch.func` is at work: what is computed now has no numbers that could be read."""
+    """Whether a transform of `torch.func` is at work, under which no numbers of a tensor can be read."""
     return torch._C._functorch.maybe_current_level() is not None
 
 
 def as_constant(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Mark a function whose result, a tensor or a named tuple of some, is a constant to whoever differentiates.
+    """Mark a function whose result, a tensor or a named tuple of tensors, counts as a constant in derivatives.
 
     `torch.no_grad` holds back gradients alone: the tangents of a forward mode pass through it.
     """
@@ -44,7 +44,7 @@ def as_constant(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def map_tensors(change: Callable[..., Tensor], value: Any, *others: Any) -> Any:
-    """A tensor, or the tensors of nested named tuples, changed: each together with its counterparts in the others."""
+    """A copy of nested named tuples with each tensor changed, together with its counterparts in `others`."""
     if isinstance(value, Tensor):
         return change(value, *others)
     if not value:
@@ -53,10 +53,10 @@ def map_tensors(change: Callable[..., Tensor], value: Any, *others: Any) -> Any:
 
 
 def is_plain(tensor: Tensor) -> bool:
-    """Whether a tensor is one of numbers alone: not a wrapper of `torch.func`, nor a tracer's without any numbers.
+    """Whether a tensor has numbers of its own, unlike a wrapper of `torch.func` or a tensor of a tracer.
 
-    Only such ones may be kept for later, and asked for numbers: the others mean nothing outside of the call that made
-    them. Of code that is being compiled none is.
+    Only plain tensors may be kept for later and asked for numbers. Other tensors mean nothing outside of the call that
+    made them. While code is being compiled no tensor is plain.
     """
     if torch.compiler.is_compiling() or type(tensor) not in (Tensor, torch.nn.Parameter):
         return False

@@ -1,4 +1,4 @@
-"""Records of tensors: moved, cut and stored as a whole; what each tensor must be is said at its field."""
+"""Records of tensors are moved, cut and stored as a whole; each field declares what its tensor must be."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from directshape_torch.numerics.checks import FOLLOWING, Kind, check_alike, chec
 
 
 class Dense:
-    """What a tensor of a record must be: `Annotated[Tensor, Dense("F", 3, 3)]`.
+    """`Dense` declares what a tensor of a record must be: `Annotated[Tensor, Dense("F", 3, 3)]`.
 
     Args:
         shape: sizes; a letter is any size, the same one wherever it stands in the record.
-        kind: of its numbers.
-        cure: what to do where the shape is another one.
+        kind: kind of the tensor's numbers.
+        cure: advice where the tensor has another shape.
     """
 
     def __init__(self, *shape: int | str, kind: Kind = "floating", cure: str = "") -> None:
         self.shape, self.kind, self.cure = shape, kind, cure
 
     def check(self, name: str, value: Tensor, sizes: dict[int | str, int]) -> None:
-        """Raise `InputError` unless a tensor is this; `sizes` are those of the letters, and grow."""
+        """Raise `InputError` unless a tensor is as declared; `sizes` has the sizes of letters and gets new ones."""
         check_shape(name, value, [sizes.get(size, size) for size in self.shape], self.cure, self.kind)
         sizes |= dict(zip(self.shape, value.shape, strict=True))
 
 
 class DeclaredTensor(NamedTuple):
-    """A tensor of a record, its name from the outermost record on, and the kind of its numbers."""
+    """A `DeclaredTensor` is a tensor of a record, its name from the outermost record on, and its kind of numbers."""
 
     name: str
     value: Tensor
@@ -41,20 +41,20 @@ class DeclaredTensor(NamedTuple):
 
 
 class Record:
-    """Base of frozen dataclasses of tensors, of further such records, and of other values."""
+    """`Record` is the base of frozen dataclasses of tensors, further records and other values."""
 
-    # Fields that are one for all rows: kept where rows are chosen.
+    # A shared field is one for all rows and is kept where rows are chosen.
     shared: ClassVar[frozenset[str]] = frozenset()
 
     @classmethod
     @cache
     def _hints(cls) -> dict[str, Any]:
-        """The types of the fields by name, with what is said of tensors."""
+        """The types of the fields by name, with the declarations of tensors."""
         hints = get_type_hints(cls, include_extras=True)
         return {each.name: hints[each.name] for each in fields(cls)}  # type: ignore[arg-type]
 
     def to(self, device: torch.device | torch.dtype | str | None = None, dtype: torch.dtype | None = None) -> Self:
-        """A copy on another device and, for floating-point tensors, of another dtype, which may come alone."""
+        """A copy on another device, and with another dtype of floating-point tensors; a dtype may come alone."""
         if isinstance(device, torch.dtype):
             device, dtype = None, device
         return self._with(lambda x: x.to(device=device, dtype=dtype if x.is_floating_point() else None))
@@ -79,7 +79,7 @@ class Record:
         return replace(self, **chosen)  # type: ignore[type-var]
 
     def _with(self, change: Callable[..., Tensor], *others: Self, by_row: bool = False) -> Self:
-        """A copy with all tensors changed, each with its counterparts; `by_row`, but what is shared."""
+        """A copy with each tensor changed, together with its counterparts; `by_row` leaves out shared fields."""
         changed: dict[str, Any] = {}
         for each in fields(self):  # type: ignore[arg-type]
             value, *theirs = (getattr(record, each.name) for record in (self, *others))
@@ -93,11 +93,13 @@ class Record:
 
 
 class TensorRecord(Record):
-    """Base of records whose tensors are declared (`Dense`; optional ones have None as default) and checked.
+    """`TensorRecord` is the base of records whose tensors are declared (by `Dense`) and checked.
+
+    Optional tensors have None as default.
 
     Raises:
-        InputError: a tensor is none, not dense, or of another shape or kind; floating-point ones differ in dtype or
-            device.
+        InputError: a value is no tensor, not dense, or of another shape or kind, or floating-point tensors differ in
+            dtype or device.
     """
 
     def __post_init__(self) -> None:
@@ -115,7 +117,7 @@ class TensorRecord(Record):
     @classmethod
     @cache
     def _declared(cls) -> dict[str, tuple[Dense, bool]]:
-        """The tensors by name: what they must be, and whether None will do."""
+        """The declaration of each tensor by name, and whether None may take its place."""
         return {
             each.name: (spec, each.default is None)
             for each in fields(cls)  # type: ignore[arg-type]
@@ -124,7 +126,7 @@ class TensorRecord(Record):
         }
 
     def in_dtype(self, dtype: torch.dtype) -> Self:
-        """The record with its numbers, and those of records in it, in a dtype; masks keep theirs."""
+        """The record with its numbers, and the numbers of records inside it, in a dtype; masks keep their dtype."""
         changed: dict[str, Any] = {}
         for each in fields(self):  # type: ignore[arg-type]
             value, (spec, _) = getattr(self, each.name), self._declared().get(each.name, (None, False))
@@ -136,7 +138,7 @@ class TensorRecord(Record):
         return self if is_same else replace(self, **changed)  # type: ignore[type-var]
 
     def tensors(self, name: str) -> Iterator[DeclaredTensor]:
-        """All tensors of the record, named `name`, and of those in it."""
+        """All tensors of the record, which is called `name`, and of records inside it."""
         declared = self._declared()
         for each in fields(self):  # type: ignore[arg-type]
             value = getattr(self, each.name)
@@ -147,7 +149,7 @@ class TensorRecord(Record):
 
     @classmethod
     def joined(cls, records: Sequence[Self]) -> Self:
-        """The rows of several records one after the other; other values than tensors and tuples are the first's."""
+        """The rows of several records one after the other; values other than tensors and tuples come from the first."""
         values: dict[str, Any] = {}
         for each in fields(cls):  # type: ignore[arg-type]
             first, *rest = (getattr(record, each.name) for record in records)
@@ -162,16 +164,16 @@ class TensorRecord(Record):
 
 
 class CarRecord(Record):
-    """Base of records of tensors (B, ...), one row a car, of such records, and of words and other values."""
+    """`CarRecord` is the base of records with one row a car: of tensors (B, ...), `CarRecord`s, words, other values."""
 
     @classmethod
     def nothing(cls, sizes: Mapping[int | str, int], like: Tensor, **known: Any) -> Self:
-        """A record of which nothing is known but some fields: NaN, and -1 for whole numbers, on the device of `like`.
+        """A record whose unknown fields are NaN, and -1 for whole numbers, on the device of `like`.
 
         Args:
-            sizes: of the letters of all shapes.
+            sizes: sizes of the letters of all shapes.
             like: any tensor.
-            known: values of fields; those that have no default and are no tensors must be there.
+            known: values of the known fields; fields without a default that are no tensors must be among them.
         """
         values = dict(known)
         for name, kind in cls._hints().items():
@@ -192,7 +194,7 @@ class CarRecord(Record):
         return self._with(lambda value: kept(value, condition), by_row=True)
 
     def put(self, rows: Tensor, others: Self) -> Self:
-        """A copy with the cars `rows` (R,) replaced; where figures have another width the others have none: NaN."""
+        """A copy with the cars `rows` (R,) replaced; figures of another width become NaN for all other cars."""
 
         def replaced(value: Tensor, other: Tensor) -> Tensor:
             if value.shape[1:] != other.shape[1:]:
@@ -202,7 +204,7 @@ class CarRecord(Record):
         return self._with(replaced, others, by_row=True)
 
     def state_dict(self, prefix: str = "") -> dict[str, Tensor]:
-        """All tensors and words by flat names, as `torch.save` and safetensors take them; words are UTF-8 bytes."""
+        """All tensors and words by flat names, for `torch.save` and safetensors; words become UTF-8 bytes."""
         state: dict[str, Tensor] = {}
         for each in fields(self):  # type: ignore[arg-type]
             value, name = getattr(self, each.name), prefix + each.name
@@ -220,7 +222,7 @@ class CarRecord(Record):
     def _from_state(
         cls, state: Mapping[str, Tensor], prefix: str = "", sizes: dict[int | str, int] | None = None, **others: Any
     ) -> Self:
-        """The record whose `state_dict` this is; `others` are the fields that are none of its values.
+        """The record whose `state_dict` is `state`; `others` are the fields that `state` does not hold.
 
         Raises:
             InputError: a value is missing or is not what its field declares.
@@ -251,7 +253,7 @@ def _words(name: str, letters: Tensor) -> tuple[str, ...]:
     check_shape(name, letters, ("n",))
     try:
         text = bytes(letters.tolist()).decode()
-    except (TypeError, ValueError) as error:  # numbers that are no bytes, bytes that are no letters
+    except (TypeError, ValueError) as error:  # some numbers are no bytes, or some bytes are no letters
         raise InputError(name, "UTF-8 bytes", shown(letters.tolist()), "save result.state_dict()") from error
     return tuple(text.split("\n")) if text else ()
 

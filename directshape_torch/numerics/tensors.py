@@ -1,4 +1,4 @@
-"""Small operations on tensors, each in the form that is cheap where it runs."""
+"""This module holds small operations on tensors, each in the form that is cheap where it runs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def take(
 ) -> Tensor:
     """The entries (*,) of a flat tensor at indices of any shape."""
     if torch.compiler.is_compiling():
-        # The same compiled code from one step instead of three: every step costs the compiler milliseconds.
+        # One step instead of three gives the same compiled code, and every step costs the compiler milliseconds.
         return flat[index]
     return flat.index_select(0, index.reshape(-1)).view(index.shape)
 
@@ -29,7 +29,7 @@ def occurrences(
 ) -> Tensor:
     """How often (count,) each of the numbers from 0 to below `count` occurs among indices.
 
-    `bincount` would let the host wait for a graphics card, to learn the largest number.
+    `bincount` would make the host wait for a graphics card to learn the largest number.
     """
     return index.new_zeros(count).scatter_add(0, index, torch.ones_like(index))
 
@@ -43,7 +43,7 @@ def constant_like(values: tuple[float, ...], like: Tensor) -> Tensor:
 
 
 def made_once(make: Callable[[torch.dtype, torch.device], _T]) -> Callable[[Tensor], _T]:
-    """For a function that makes constants of a dtype on a device: one that gives those like a tensor."""
+    """A function that gives constants of the dtype and device of a tensor, which `make` makes once for each."""
     constants: dict[_Key, Any] = {}
 
     @wraps(make)
@@ -65,10 +65,10 @@ def _kept(
     make: Callable[[torch.dtype, torch.device], _T],
 ) -> _T:
     if torch.compiler.is_compiling():
-        # Constants of the compiled code, made without a change of mode, with which PyTorch stores no traces on disk.
+        # These become constants of the compiled code. PyTorch stores no traces on disk where the gradient mode changes.
         return make(like.dtype, like.device)
     key = (values, like.dtype, like.device)
-    # A tracer's tensors go with its own constants alone; those of `torch.func` with all.
+    # A tracer's tensors only go with constants of the tracer, tensors of `torch.func` with all constants.
     known: _T | None = constants.get(key) if type(like) is Tensor else None
     if known is not None:
         return known
@@ -82,12 +82,12 @@ def _kept(
 
 
 def length(vectors: Tensor, dim: int) -> Tensor:
-    """Euclidean length along an axis; at zero its derivative is NaN."""
+    """Euclidean length along an axis, whose derivative is NaN at zero."""
     return (vectors * vectors).sum(dim).sqrt()
 
 
 def all_along(flags: Tensor, dim: int) -> Tensor:
-    """`flags.all(dim)` of an axis with few entries."""
+    """The result of `flags.all(dim)`, fast for an axis with few entries."""
     if torch.compiler.is_compiling():
         return flags.all(dim)  # one step to trace, and the compiler writes the loop
     return flags.view(torch.uint8).amin(dim).view(torch.bool)
@@ -101,7 +101,7 @@ def not_negative(values: Tensor) -> Tensor:
         tensor([2., 0., 0.])
     """
     if torch.compiler.is_compiling():
-        # Of `nan_to_num` the compiler makes a loop over single numbers.
+        # The compiler turns `nan_to_num` into a loop over single numbers.
         return torch.where(values >= 0, values, 0.0)
     return values.nan_to_num(0.0).clamp_min(0)
 
@@ -111,6 +111,6 @@ def cross(left: Tensor, right: Tensor) -> Tensor:
     if not torch.compiler.is_compiling():
         product: Tensor = torch.linalg.cross(left, right)
         return product
-    # The compiler looks up each component of PyTorch's own by a computed index.
+    # In PyTorch's own function the compiler would look up each component by a computed index.
     (x, y, z), (u, v, w) = ([vectors[..., k] for k in range(3)] for vectors in (left, right))
     return torch.stack([y * w - z * v, z * u - x * w, x * v - y * u], dim=-1)
