@@ -1,1 +1,1 @@
-"""The damped Gauss-Newton loop over a batch of independent problems."""
+"""This package has the damped Gauss-Newton loop over a batch of problems."""

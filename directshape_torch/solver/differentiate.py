@@ -1,7 +1,7 @@
-"""Derivatives of a minimum by whatever the problem is made of: unrolled iterations, or the implicit function theorem.
+"""This module differentiates a minimum by the problem's inputs, through unrolled iterations or implicitly.
 
-Both give back the minimum's own values with an autograd graph attached. Sets that a stage fixes (pixels, counts, zeta),
-accepted steps, their damping and lengths are constants.
+The second way is the implicit function theorem. Both return the minimum's own values with an autograd graph. Sets that
+a stage fixes (pixels, counts, zeta), accepted steps, their damping and lengths are constants.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from directshape_torch.solver.problem import (
 
 
 class NotStationaryWarning(UserWarning):
-    """Problems without implicit gradient, because their iterations ended too far from a stationary point."""
+    """Some problems have no implicit gradient, because their iterations ended too far from a stationary point."""
 
 
 class StartNotReachedWarning(UserWarning):
-    """Problems whose start has no gradient, because fewer steps are repeated than have led away from it."""
+    """The start of some problems has no gradient, because fewer steps are repeated than have led away from it."""
 
 
 def unrolled_state(
@@ -44,12 +44,12 @@ def unrolled_state(
     """The states of some problems as functions of the problem (and of the start), by repeating their last steps.
 
     Args:
-        problem: those problems alone, no stage begun.
-        start: their states before the first iteration, with a graph where wanted; it counts for problems that took
-            no more than `num_iterations` steps.
-        minimum: of all problems, with its trajectory.
-        rows: (R,) which of them.
-        num_iterations: how many of its last steps are repeated for each problem; memory grows with it.
+        problem: the R problems alone, no stage begun.
+        start: states of the R problems before the first iteration, with a graph where wanted; it counts for problems
+            that took at most `num_iterations` steps.
+        minimum: result of all problems, with its trajectory.
+        rows: (R,) numbers of the R problems among all problems.
+        num_iterations: how many last steps are repeated for each problem; memory grows with it.
         names: (R,) the numbers by which a `StartNotReachedWarning` names problems whose start wants a gradient and gets
             none; default `rows`.
 
@@ -73,7 +73,7 @@ def unrolled_state(
         if stage is None or iteration.stage != begun:
             begun = iteration.stage
             began = take_rows(minimum.stage_starts[begun], rows)
-            # Where the repeated steps have led to it, the state at which a stage begins is a function too.
+            # The state at which a stage begins is a function, too, where the repeated steps have led to it.
             began = where_rows(led_here, _with_values(began, state), began)
             stage = problem.begin(begun, problem.look(began))
         state = where_rows(taken, _step(problem, stage, state, iteration), state)
@@ -82,7 +82,7 @@ def unrolled_state(
 
 
 def _steps_that_led_to_the_end(trajectory: Sequence[Iteration[StateT]]) -> Tensor:
-    """(N, R) bool: accepted steps, without those after the best state of a stage, which is where the next begins."""
+    """Accepted steps (N, R) up to the best state of each stage, at which the next stage begins, bool."""
     accepted, improved = (torch.stack([getattr(it, name) for it in trajectory]) for name in ("accepted", "improved"))
     stage = torch.tensor([it.stage for it in trajectory], device=accepted.device)
     counts = torch.zeros_like(accepted)
@@ -112,18 +112,18 @@ def implicit_state(
 ) -> StateT:
     """The states of some problems as functions of the problem, by the implicit function theorem at the final stage.
 
-    At a minimum the gradient g(state, theta) is zero, hence `d state / d theta = -(dg/dstate)^-1 dg/dtheta`: D
-    backward passes through g for the Jacobian and one solve for each problem, whatever the number of iterations.
+    At a minimum the gradient g(state, theta) is zero, hence `d state / d theta = -(dg/dstate)^-1 dg/dtheta`. This takes
+    D backward passes through g for the Jacobian and one solve for each problem, whatever the number of iterations.
 
     Args:
-        problem: those problems alone, no stage begun.
-        minimum: of all problems.
-        rows: (R,) which of them.
+        problem: the R problems alone, no stage begun.
+        minimum: result of all problems.
+        rows: (R,) numbers of the R problems among all problems.
         exact: True takes the exact Jacobian of g, False the Gauss-Newton matrix in its place, which lacks the
             second derivatives of the residuals: cheaper and biased.
         max_remaining_step: problems whose next Newton step would exceed this share of the trust region are not at a
-            stationary point: no gradient, and a `NotStationaryWarning` that names them.
-        names: (R,) the numbers by which the warning names them; default `rows`.
+            stationary point; they get no gradient, and a `NotStationaryWarning` names them.
+        names: (R,) the numbers by which the warning names problems; default `rows`.
 
     Returns:
         States of the R problems: the values of `minimum`; unknowns at a bound are constants.
@@ -149,7 +149,7 @@ def implicit_state(
 def _gradient_and_its_jacobian(
     stage: BegunStage[StateT], state: StateT, delta: Tensor, exact: bool
 ) -> tuple[EnergyAt, Tensor]:
-    """g with its graph to the problem, and its Jacobian (R, D, D) by the tangent at the state, without one."""
+    """The gradient g with its graph to the problem, and its Jacobian (R, D, D) by the tangent, without a graph."""
     if not exact:
         at = stage.linearise_differentiably(state)
         return at, at.hessian.detach()
@@ -192,7 +192,7 @@ def _step(
     state: StateT,
     iteration: Iteration[StateT],
 ) -> StateT:
-    """The step of one iteration; who took it together with others says the trajectory."""
+    """The state after the step of one iteration; the trajectory says which problems of a group took it together."""
     at, together = stage.linearise_differentiably(state), iteration.accepted
     step, _ = problem.sharing.damped_step(at.hessian, at.gradient, iteration.damping, together)
     step = step * iteration.lengths[:, None]

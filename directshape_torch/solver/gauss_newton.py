@@ -1,4 +1,4 @@
-"""The one loop: damped Gauss-Newton over a batch of independent problems, a status for each."""
+"""This module has the one loop: damped Gauss-Newton over a batch of problems, with a status for each."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from directshape_torch.solver.problem import (
 )
 from directshape_torch.status import Status, is_refined
 
-# What leaving ended problems out must save, in iterations of one: the others are copied for it, and few problems take
-# nearly as long as fewer, one by itself longer than two (it has no compiled form).
+# Ended problems are left out where that saves at least this many iterations of one problem, because the others must be
+# copied. A few problems take nearly as long as fewer, and one problem takes longer than two (it has no compiled form).
 _WORTH_LEAVING_OUT = 16
 
 
 @dataclass(frozen=True)
 class Iteration(Generic[StateT]):
-    """What must be known to repeat one iteration of all B problems."""
+    """An `Iteration` holds what must be known to repeat one iteration of all B problems."""
 
-    stage: int  # number of its stage
-    state: StateT  # states before it
+    stage: int  # number of the stage
+    state: StateT  # states before the iteration
     damping: Tensor  # (B,) Marquardt's mu
     lengths: Tensor  # (B,) what the steps were multiplied by, before their limits
     accepted: Tensor  # (B,) bool: the step was taken; false for problems that took no part
-    improved: Tensor  # (B,) bool: it led to the best state of the stage so far
+    improved: Tensor  # (B,) bool: the step led to the best state of the stage so far
 
 
 @dataclass(frozen=True)
 class Minimum(Generic[StateT]):
-    """Result of a minimisation."""
+    """A `Minimum` is the result of a minimisation."""
 
-    state: StateT  # final states; the input's where the status says so
+    state: StateT  # final states, which are the input states where the status says so
     end: StateT  # states where the iterations ended, whatever the status says
     status: Tensor  # (B,) integer codes of `Status`
     iterations: Tensor  # (B,) iterations done
@@ -52,12 +52,12 @@ class Minimum(Generic[StateT]):
     stage: Any  # the last stage that has begun, of all problems
     seen_end: Any  # what the problem's `look` gave where the iterations ended
     before: Any  # the last stage's figures at the input states
-    after: Any  # and where the iterations ended
+    after: Any  # the last stage's figures where the iterations ended
     trajectory: tuple[Iteration[StateT], ...] = ()  # all iterations in order, if they were asked for
 
 
 class _Log(Generic[StateT]):
-    """What is kept of the iterations of one stage: rows of a compacted batch, put in their places a block at a time."""
+    """A `_Log` keeps the iterations of one stage: rows of a compacted batch are put in their places block by block."""
 
     def __init__(
         self,
@@ -73,7 +73,7 @@ class _Log(Generic[StateT]):
         self.running: list[Tensor] = []
 
     def add(self, rows: Tensor, before: tuple[StateT, Tensor, Tensor], outcome: IterationOutcome, cost: Tensor) -> None:
-        """One iteration: state, damping and which steps were stretched, then what came of it, all for these rows."""
+        """Add one iteration of `rows`: state, damping and stretched steps before it, then its outcome and cost."""
         self.costs.append(cost)
         self.running.append(outcome.running)
         if self.trajectory is None:
@@ -93,7 +93,7 @@ class _Log(Generic[StateT]):
         )
 
     def end_block(self, rows: Tensor) -> None:
-        """The costs of a block into columns (B, iterations) of all problems."""
+        """Write the costs of a block into columns (B, iterations) of all problems."""
         if not self.costs:
             return
         # Problems that have ended stay in the batch until it is worth leaving them out.
@@ -105,7 +105,7 @@ class _Log(Generic[StateT]):
 
 @dataclass(frozen=True)
 class _Unfailed:
-    """The problems that had not failed when the host last read how they ended: as a mask (B,), and their numbers."""
+    """These problems had not failed when the host last read how they ended: a mask (B,) and their numbers."""
 
     keep: Tensor
     numbers: list[int]
@@ -125,10 +125,10 @@ def minimise(
 
     Args:
         problem: B problems.
-        initial: their input states, returned where a problem fails and compared with the outcome.
+        initial: input states, which are returned where a problem fails and compared with the outcome.
         config: damping, acceptance, convergence.
         start: where the iterations begin; default the input states.
-        record: keep the trajectory.
+        record: whether to keep the trajectory.
     """
     with torch.no_grad():
         seen_initial = problem.look(initial)
@@ -148,7 +148,7 @@ def minimise(
             iterations = iterations + done
             seen = problem.look(state)
         before, after = stage.figures(seen_initial), stage.figures(seen)
-        # Compared at the final stage: nothing ends worse than it began.
+        # Costs are compared at the final stage, so that no problem ends worse than it began.
         status = torch.where(ended < 0, Status.max_iterations.code, ended)
         worse = ~(after.cost <= before.cost)
         status = torch.where(worse & ~has_failed(ended), Status.rejected_worse.code, status)
@@ -178,7 +178,7 @@ def _run_stage(
     config: SolverConfig,
     log: _Log[StateT],
 ) -> tuple[StateT, Tensor, Tensor, _Unfailed]:
-    """States, how each problem ended, iterations done, and what the host knows by then."""
+    """States, ends and iterations of all problems after a stage, and the problems that have not failed."""
     iterations = torch.zeros_like(ended)
     numbers = unfailed.numbers
     if not numbers:
@@ -217,6 +217,6 @@ def _run_stage(
 
 
 def _read(ended: Tensor) -> list[int]:
-    """How problems (B,) ended, read by the host: the only synchronisation of a block, at its end."""
+    """The ends of problems (B,), read by the host, which is the only synchronisation of a block, at its end."""
     codes: list[int] = ended.tolist()
     return codes

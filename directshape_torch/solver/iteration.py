@@ -1,4 +1,4 @@
-"""One damped Gauss-Newton iteration of a batch of problems, without a word to the host."""
+"""This module does one damped Gauss-Newton iteration of a batch of problems, without waiting for the device."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from directshape_torch.status import Status
 
 
 def step_lengths(stretched: Tensor, over_relaxation: float) -> Tensor:
-    """What steps are multiplied by: `over_relaxation` where they are to be longer, else 1.
+    """The factors of steps: `over_relaxation` where steps are to be longer, else 1.
 
     The Gauss-Newton matrix of a reweighted residual (IRLS) usually overestimates its curvature, so that plain steps
-    approach the minimum from one side, a share of the way at a time. Longer ones save iterations, and below a factor of
-    2 a quadratic energy still falls. The solver stretches the first step of a stage and each that follows one that
-    paid. Else the next one is plain, and more damped where the longer one was refused; if that promises and brings next
-    to nothing, the problem has settled.
+    approach the minimum from one side, a share of the way at a time. Longer steps save iterations, and below a
+    factor of 2 a quadratic energy still falls. The solver stretches the first step of a stage and each step that
+    follows a sufficient decrease of the cost. Otherwise the next step is plain, and more damped where the longer step
+    was refused. If a plain step promises and brings next to nothing, the problem has settled.
 
     Args:
         stretched: (B,) bool, which steps are to be longer.
@@ -38,42 +38,42 @@ def step_lengths(stretched: Tensor, over_relaxation: float) -> Tensor:
     return torch.where(stretched, over_relaxation, 1.0)
 
 
-# Of a problem that goes on; else the code of the status with which it ended.
+# A problem that goes on has this code; a problem that has ended has the code of its status.
 RUNNING = -1
-# Factors of Marquardt's mu after an accepted and after a refused step, and its bounds; a problem whose step is refused
-# at the upper one has converged.
+# Marquardt's mu changes by these factors after an accepted and after a refused step, within these bounds. A problem
+# whose step is refused at the upper bound has converged.
 _DAMPING_DECREASE, _DAMPING_INCREASE = 0.3, 8.0
 _LEAST_DAMPING, _MOST_DAMPING = 1e-7, 1e5
-# Of tolerances: where a step promises and changes no more, its refusal is no overshoot that damping could mend, but the
-# roughness of a cost at its lowest.
+# Where a refused step promises and changes at most this many tolerances of the cost, it is not too long: the cost is at
+# its lowest and rough, and more damping would not help.
 _FLAT = 10.0
 
 
 class IterationOutcome(NamedTuple):
-    """What an iteration did to each problem, (B,) bool."""
+    """An `IterationOutcome` says what an iteration did to each problem, (B,) bool."""
 
-    running: Tensor  # it took part
-    accepted: Tensor  # its step was taken
-    improved: Tensor  # that led to its best state
+    running: Tensor  # the problem took part
+    accepted: Tensor  # the step was taken
+    improved: Tensor  # the step led to the best state
 
 
 @dataclass
 class Progress(Generic[StateT]):
-    """What changes from iteration to iteration, for the problems of one compacted batch."""
+    """`Progress` is what changes from iteration to iteration, for the problems of one compacted batch."""
 
     state: StateT
     best_state: StateT
     best_cost: Tensor  # (B,)
     at_state: Any  # `EnergyAt`
     damping: Tensor  # (B,)
-    stretched: Tensor  # (B,) bool: where steps are over-relaxed, the next one is
+    stretched: Tensor  # (B,) bool: whether the next step is over-relaxed, in stages that over-relax
     ended: Tensor  # (B,) status code or RUNNING
     iterations: Tensor  # (B,)
 
     def take(
         self, problem: StageProblem[StateT], keep: Tensor, numbers: Sequence[int]
     ) -> tuple[StageProblem[StateT], Progress[StateT]]:
-        """Those of the problems where `keep` (B,) holds, `numbers` of them, and their progress."""
+        """The problems where `keep` (B,) holds, which are at the places `numbers`, and their progress."""
         index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
         part, at_state = problem.of_problems(keep, numbers, self.at_state)
         state, best_state = (take_rows(state, index) for state in (self.state, self.best_state))
@@ -81,7 +81,7 @@ class Progress(Generic[StateT]):
         return part, Progress(state, best_state, self.best_cost[index], at_state, *(x[index] for x in others))
 
     def scatter(self, rows: Tensor, state: StateT, ended: Tensor, iterations: Tensor) -> tuple[StateT, Tensor, Tensor]:
-        """Best states, ends and iterations of all problems, of which these are the rows."""
+        """Best states, ends and iterations of all problems, with this batch put into its rows."""
         return (
             put_rows(state, rows, self.best_state),
             ended.index_copy(0, rows, self.ended),
@@ -100,7 +100,7 @@ def has_failed(ended: Tensor) -> Tensor:
 
 
 def begin(state: StateT, at_state: Any, ended: Tensor, config: SolverConfig) -> Progress[StateT]:
-    """At the first states of a stage and their evaluation, with the ends (B,) of the stage before."""
+    """The progress at the first states of a stage and their evaluation, with the ends (B,) of the stage before."""
     fresh = torch.where(_is_finite(at_state), RUNNING, Status.non_finite.code)
     return Progress(
         state=state,
@@ -109,7 +109,7 @@ def begin(state: StateT, at_state: Any, ended: Tensor, config: SolverConfig) -> 
         at_state=at_state,
         damping=torch.full_like(at_state.cost, config.initial_damping),
         stretched=torch.ones_like(fresh, dtype=torch.bool),
-        # Of the stage before only failures count: what has converged there goes on.
+        # Only failures of the stage before count; problems that converged in it go on.
         ended=torch.where(has_failed(ended), ended, fresh),
         iterations=torch.zeros_like(ended),
     )
@@ -122,14 +122,14 @@ def iterate(
     limits: Tensor,
     over_relaxation: float = 1.0,
 ) -> IterationOutcome:
-    """One iteration of a batch, whose progress is written to.
+    """Do one iteration of a batch, and write it into the progress.
 
     Args:
         problem: B problems.
-        p: where they are.
+        p: progress of the problems.
         config: damping, acceptance, convergence.
         limits: (D,) largest trusted step of each unknown.
-        over_relaxation: of the stage.
+        over_relaxation: factor of the stage's longer steps.
     """
     share, running = problem.sharing, p.ended < 0
     step, solvable = share.damped_step(p.at_state.hessian, p.at_state.gradient, p.damping, running)
@@ -153,7 +153,7 @@ def iterate(
         small_decrease = small_decrease & downhill
     has_settled, exhausted = accepted & small_decrease, ~accepted & at_limit
     if over_relaxation != 1:
-        # A longer step may end beyond the minimum and about as high: it is for a plain one to say that this is all.
+        # A longer step may end beyond the minimum and about as high, so only a plain step shows that a problem settled.
         promised = share.total(-0.5 * (p.at_state.gradient * step).sum(dim=1), takeable)
         changes_little = (promised <= _FLAT * little) & (-decrease <= _FLAT * little)
         at_rest = takeable & ~accepted & changes_little
@@ -161,7 +161,7 @@ def iterate(
         p.stretched = downhill & ~small_decrease
     settled = running & solvable & ((size < config.step_tolerance) | has_settled | exhausted)
     p.ended = p.ended.masked_fill(settled, Status.converged.code)
-    # A group does not wait for those who cannot go along.
+    # A group does not wait for members that cannot step.
     left = running & ~takeable & share.any(takeable)
     hopeless = left | running & at_limit if config.initial_damping > 0 else running
     p.ended = p.ended.masked_fill(hopeless & ~solvable, Status.singular.code)
@@ -179,7 +179,7 @@ def _move(
     accepted: Tensor,
     config: SolverConfig,
 ) -> Tensor:
-    """To the candidates where they are accepted; returns where that made the best state."""
+    """Move to the candidates where they are accepted, and return where that gives the best state."""
     p.state = where_rows(accepted, candidate, p.state)
     p.at_state = problem.choose(accepted, at_candidate, p.at_state)
     if config.initial_damping > 0:
@@ -187,7 +187,7 @@ def _move(
         larger = (p.damping * _DAMPING_INCREASE).clamp_max(_MOST_DAMPING)
         p.damping = torch.where(accepted, smaller, larger)
     if not config.accept_every_step:
-        # Nothing uphill is taken: the present state is the best one.
+        # No uphill step is taken, so the present state is the best one.
         p.best_state, p.best_cost = p.state, p.at_state.cost
         return accepted
     better = accepted & (problem.sharing.total(p.best_cost - at_candidate.cost, accepted) >= 0)

@@ -1,7 +1,7 @@
-"""What the solver sees of a batch of B least-squares problems of D unknowns each.
+"""This module says what the solver needs of a batch of B least-squares problems of D unknowns each.
 
-A problem is looked at, at a state; there a stage begins, whose iterations evaluate state after state, each near the
-one before. All of these are values: whoever needs one later keeps it.
+`look` prepares a problem at a state. A stage begins at that state, and its iterations evaluate state after state, each
+near the state before. All results are values, which a caller may keep for later.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from directshape_torch.solver.sharing import Sharing
 
 
 class TensorTuple(Protocol):
-    """A named tuple of tensors (B, ...), one row for each problem."""
+    """A `TensorTuple` is a named tuple of tensors (B, ...), with one row for each problem."""
 
     def __iter__(self) -> Iterator[Tensor]: ...
 
@@ -31,7 +31,7 @@ StateT = TypeVar("StateT", bound=TensorTuple)
 
 
 class EnergyAt(Protocol):
-    """Cost, gradient and Gauss-Newton matrix of each problem at one state, in float64."""
+    """`EnergyAt` is the cost, gradient and Gauss-Newton matrix of each problem at one state, in float64."""
 
     @property
     def cost(self) -> Tensor:  # (B,)
@@ -47,19 +47,19 @@ class EnergyAt(Protocol):
 
 
 class StageProblem(Protocol[StateT]):
-    """What the iterations of a stage see of B problems, and of fewer and fewer of them."""
+    """A `StageProblem` is what the iterations of a stage need of B problems, which become fewer as problems end."""
 
     @property
     def sharing(self) -> Sharing:
-        """What the problems have in common."""
+        """The unknowns that problems share."""
         ...
 
     def evaluate(self, state: StateT, near: Any) -> Any:
-        """The `EnergyAt` a state next to that of another evaluation."""
+        """The `EnergyAt` of a state that is near the state of another evaluation."""
         ...
 
     def choose(self, accepted: Tensor, new: Any, old: Any) -> Any:
-        """The new evaluation of problems whose step was accepted (B,) bool, the old one of the others."""
+        """The new evaluation of problems whose step was accepted (B,) bool, the old evaluation of other problems."""
         ...
 
     def retract(self, state: StateT, step: Tensor) -> StateT:
@@ -67,26 +67,26 @@ class StageProblem(Protocol[StateT]):
         ...
 
     def of_problems(self, keep: Tensor, numbers: Sequence[int], at: Any) -> tuple[StageProblem[StateT], Any]:
-        """The same without the problems where `keep` (B,) is false, with their evaluation.
+        """The problems where `keep` (B,) holds, and their evaluation.
 
-        `numbers` of those that stay, which the host knows.
+        `numbers` are the places where `keep` holds, as the host knows them.
         """
         ...
 
 
 class BegunStage(Protocol[StateT]):
-    """A stage of all problems, with everything fixed that must not change while costs are compared."""
+    """A `BegunStage` is a stage of all problems, which fixes everything that must not change while costs compare."""
 
     def start(self, seen: Any) -> tuple[StageProblem[StateT], Any]:
-        """What the iterations work on, and the `EnergyAt` the state where they begin."""
+        """The problem that the iterations work on, and the `EnergyAt` of the state where they begin."""
         ...
 
     def figures(self, seen: Any) -> Any:
-        """What is said of a state that was looked at by itself; the solver compares nothing but its `cost` (B,)."""
+        """The figures of a state from `look`, of which the solver only compares the `cost` (B,)."""
         ...
 
     def linearise_differentiably(self, state: StateT) -> Any:
-        """The `EnergyAt` a state, with an autograd graph to the state and to the problem's own inputs."""
+        """The `EnergyAt` of a state, with an autograd graph to the state and to the problem's own inputs."""
         ...
 
     def free_unknowns(self, state: StateT) -> Tensor:
@@ -103,21 +103,21 @@ class BegunStage(Protocol[StateT]):
 
 
 class Problem(Protocol[StateT]):
-    """B problems, by themselves or in groups that share unknowns."""
+    """A `Problem` is a batch of B problems, by themselves or in groups that share unknowns."""
 
     @property
     def sharing(self) -> Sharing:
-        """What the problems have in common."""
+        """The unknowns that problems share."""
         ...
 
     def stages(self) -> Sequence[StageConfig]: ...
 
     def look(self, state: StateT) -> Any:
-        """What everything that is asked of a state begins with."""
+        """The preparation of a state, with which stages and figures begin."""
         ...
 
     def begin(self, stage: int, seen: Any) -> BegunStage[StateT]:
-        """The stage of that number, which begins at a state that was looked at; -1 is the last one."""
+        """The stage of that number, which begins at a state from `look`; -1 is the last stage."""
         ...
 
     def of_problems(self, keep: Tensor) -> Problem[StateT]:
@@ -144,7 +144,7 @@ def where_rows(condition: Tensor, a: StateT, b: StateT) -> StateT:
     """Rows of `a` where the condition (B,) holds, else of `b`."""
 
     def chosen(x: Tensor, y: Tensor) -> Tensor:
-        # What there is nothing of is alike.
+        # Tensors with empty rows need no choice.
         return torch.where(condition.view(-1, *[1] * (x.ndim - 1)), x, y) if x.shape[1:].numel() else x
 
     return remade(a, map(chosen, a, b))

@@ -1,4 +1,4 @@
-"""Problems that share unknowns: the views of one car have poses of their own and one shape.
+"""This module lets problems share unknowns: the views of one car have poses of their own and one shape.
 
 The solver asks a `Sharing` for steps, sums and maxima, so that problems by themselves and problems in groups go through
 one loop. A group takes a step together or not at all; it does not wait for a problem that has ended, or cannot step.
@@ -18,19 +18,19 @@ from directshape_torch.solver.damped_solve import damped_solution, damped_step, 
 
 
 class Sharing:
-    """What B problems have in common, here nothing: each is a group of its own. `members` (B,) bool says who counts."""
+    """A `Sharing` groups B problems, in this class one by one. `members` (B,) bool says which problems count."""
 
     def damped_step(self, hessian: Tensor, gradient: Tensor, damping: Tensor, members: Tensor) -> tuple[Tensor, Tensor]:
         """The step (B, D) of `(H + mu diag(H)) step = -g`, and where (B,) there is one; see `damped_step`.
 
-        A member without a step of its own unknowns does not spoil that of the others.
+        A member whose own unknowns have no step does not spoil the step of other members.
         """
         return damped_step(hessian, gradient, damping)
 
     def newton_step(self, J: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
         """The step (B, D) of `J step = -g`, differentiable by the gradient alone, and where (B,) there is one.
 
-        J (B, D, D) is that of each problem's own gradient by its own unknowns; a group's is the sum.
+        J (B, D, D) is the Jacobian of each problem's gradient by its own unknowns; the Jacobian of a group is the sum.
         """
         return newton_step(J, gradient)
 
@@ -47,15 +47,15 @@ class Sharing:
         return flags
 
     def with_others(self, information: Tensor, members: Tensor) -> Tensor:
-        """Fisher matrices of each problem, from those of all (B, D, D), with what the others of its group say.
+        """Fisher matrices of the problems, from matrices (B, D, D) of each alone, with the information of its group.
 
-        The inverse is each problem's block of the inverse of the group's matrix. Unknowns of another problem are none
-        of it.
+        The inverse is each problem's block of the inverse of the group's matrix. Unknowns of other problems are left
+        out.
         """
         return information
 
     def of_problems(self, numbers: Sequence[int]) -> Sharing:
-        """That of fewer problems."""
+        """The sharing of the problems with these numbers."""
         return self
 
 
@@ -64,19 +64,19 @@ INDEPENDENT = Sharing()
 
 @dataclass(frozen=True)
 class Groups(Sharing):
-    """B problems in G groups, which share some of their D unknowns and step by one dense system of N a group."""
+    """`Groups` are G groups of B problems, which share some of D unknowns and step by one dense system of N a group."""
 
-    group: tuple[int, ...]  # (B,) of each problem, as the host knows it
-    place: tuple[int, ...]  # (B,) where it stands there
-    own: Tensor  # (P,) numbers of the unknowns of a problem by itself
-    shared: Tensor  # (K,) of those that a group has in common
-    # (Q,) numbers of those that are the first own ones of the problem in the next place of the group; constants where
-    # nobody stands there
+    group: tuple[int, ...]  # (B,) group of each problem, as the host knows it
+    place: tuple[int, ...]  # (B,) place of each problem in its group
+    own: Tensor  # (P,) numbers of the unknowns that a problem has for itself
+    shared: Tensor  # (K,) numbers of the unknowns that a group has in common
+    # (Q,) numbers of the unknowns that are the first own unknowns of the problem in the next place of the group, and
+    # constants where that place is empty
     of_next: Tensor
-    of_problem: Tensor  # (B,) the group on the device
+    of_problem: Tensor  # (B,) group of each problem, on the device
     rows: Tensor  # (G, F) the problem in each place; an empty place repeats the first
-    filled: Tensor  # (G, F) bool
-    column: Tensor  # (B, D) of each unknown in the system of its group
+    filled: Tensor  # (G, F) bool, which places are filled
+    column: Tensor  # (B, D) column of each unknown in the system of its group
 
     @classmethod
     def of(
@@ -87,7 +87,7 @@ class Groups(Sharing):
         of_next: Tensor | None = None,
         place: Sequence[int] | None = None,
     ) -> Groups:
-        """Problems of the same number share; without places they stand as they come.
+        """The groups of problems with equal numbers in `group`; without `place`, problems keep their order.
 
         Examples:
             >>> groups = Groups.of([7, 3, 7], own=torch.arange(2), shared=torch.arange(2, 3))
@@ -114,7 +114,7 @@ class Groups(Sharing):
         column = first.new_empty(len(group), len(own) + len(shared) + len(of_next))
         column[:, own] = first + torch.arange(len(own), device=own.device)
         column[:, of_next] = first + len(own) + torch.arange(len(of_next), device=own.device)
-        # One place more than there are: nobody stands behind the last.
+        # The system has room for one more place, because no problem follows the last.
         column[:, shared] = len(own) * (longest + 1) + torch.arange(len(shared), device=own.device)
         return cls(
             group=tuple(group),
@@ -130,7 +130,7 @@ class Groups(Sharing):
 
     @property
     def everybody(self) -> Tensor:
-        """Members (B,): all."""
+        """The members (B,) where all problems count."""
         return torch.ones_like(self.of_problem, dtype=torch.bool)
 
     def of_problems(self, numbers: Sequence[int]) -> Groups:
@@ -160,7 +160,8 @@ class Groups(Sharing):
         nothing = torch.zeros_like(information[:, 0])
         members = members & self._steps_by_itself(information, nothing, nothing[:, 0])
         system, _ = self._system(information, nothing, members)
-        # What is added to the shared ones comes off again: without it there is no inverse where they are not all seen.
+        # The diagonal of shared unknowns is raised and later lowered again, because there would be no inverse where the
+        # data do not see all of them.
         seen = system.diagonal(dim1=1, dim2=2)
         is_shared = torch.arange(seen.shape[1], device=seen.device) >= seen.shape[1] - len(self.shared)
         added = torch.where(is_shared, torch.where(seen > 0, seen, 1.0), 0.0)
@@ -173,22 +174,22 @@ class Groups(Sharing):
         return torch.where(members[:, None, None], widened, information[:, kept[:, None], kept])
 
     def _members(self, values: Tensor, members: Tensor) -> Tensor:
-        """Values (B, ...) in their places (G, F, ...), 0 in those without a member."""
+        """Values (B, ...) in their places (G, F, ...), 0 in places without a member."""
         is_member = self.filled & members[self.rows]
         return torch.where(is_member.view(*is_member.shape, *(1,) * (values.ndim - 1)), values[self.rows], 0)
 
     def _steps_by_itself(self, matrix: Tensor, gradient: Tensor, damping: Tensor) -> Tensor:
-        """Problems (B,) whose own unknowns have a step, the others standing still, and that have numbers."""
+        """Problems (B,) with finite numbers whose own unknowns have a step while all other unknowns stay fixed."""
         _, solvable = damped_step(matrix[:, self.own[:, None], self.own], gradient[:, self.own], damping)
         return solvable & is_finite(matrix.sum(dim=(1, 2)) + gradient.sum(dim=1))
 
     def _system(self, matrix: Tensor, gradient: Tensor, members: Tensor) -> tuple[Tensor, Tensor]:
-        """Matrices (G, N, N) and gradients (G, N) of the members together; what no member owns is held."""
+        """Matrices (G, N, N) and gradients (G, N) of the members together; unknowns without a member are held."""
         num_groups, size = len(self.rows), len(self.own) * (self.filled.shape[1] + 1) + len(self.shared)
         entry = self.of_problem[:, None] * size + self.column
 
         def total(entries: Tensor, values: Tensor) -> Tensor:
-            # In float64 a processor adds one after the other.
+            # In float64 a processor adds values one after the other.
             values = torch.where(members.view(-1, *(1,) * (values.ndim - 1)), values, 0)
             return values.new_zeros(num_groups * size ** (values.ndim - 1)).index_put((entries,), values, True)
 
@@ -200,7 +201,7 @@ class Groups(Sharing):
         return together, torch.where(is_owned, total(entry, gradient).view(num_groups, size), 0.0)
 
     def _of_problems(self, step: Tensor, solvable: Tensor) -> tuple[Tensor, Tensor]:
-        """The steps (B, D) of all problems, from those of their groups (G, N)."""
+        """The steps (B, D) of all problems, from the steps of their groups (G, N), and where (B,) they are."""
         return torch.where(solvable[:, None], step[self.of_problem[:, None], self.column], 0.0), solvable
 
 
@@ -215,10 +216,10 @@ def said_of_shared(
     own: Tensor,
     shared: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What quadratics say of the shared unknowns alone, the own ones following: `x^T A x / 2 - r^T x`.
+    """Quadratics `x^T A x / 2 - r^T x` of the shared unknowns x alone, where the own unknowns follow x.
 
     Returns:
-        A (B, K, K), r (B, K), and where (B,) there is one.
+        A (B, K, K), r (B, K), and where (B,) there is a quadratic.
 
     Examples:
         >>> matrix, gradient = torch.tensor([[[4.0, 2.0], [2.0, 2.0]]]), torch.tensor([[4.0, 0.0]])
