@@ -1,1 +1,1 @@
-"""Dense disparity from image pairs, and points and ground planes from it."""
+"""This package finds dense disparity of image pairs, and points and ground planes from the disparity."""

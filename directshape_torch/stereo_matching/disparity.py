@@ -1,4 +1,4 @@
-"""Dense disparity of a rectified pair by OpenCV's semi-global matching."""
+"""This module finds dense disparity of rectified pairs by OpenCV's semi-global matching."""
 
 from __future__ import annotations
 
@@ -24,15 +24,16 @@ def match_disparity(
 ) -> NDArray[np.float32]:  # (H, W)
     """Disparity of each left pixel, `u_left - u_right`, with a left-right and a uniqueness check.
 
-    Mode HH4 goes four ways through the image: on rendered frames with known depth its median error is 0.02 px and that
-    of the three-way mode -0.07 px. It still leans towards whole pixels by up to 0.2 px, which `subpixel` takes away.
+    Mode HH4 goes four ways through the image: on rendered frames with known depth its median error is 0.02 px, and the
+    error of the three-way mode is -0.07 px. Disparities are still biased towards whole pixels by up to 0.2 px, which
+    `patch_alignment` removes.
 
     Args:
         image_left, image_right: rectified pair, RGB uint8 of one size.
         num_disparities: the largest disparity searched, a multiple of 16.
 
     Returns:
-        pixels, NaN where unknown.
+        Disparity in pixels, NaN where unknown.
     """
     import cv2
 
@@ -74,11 +75,11 @@ def _check_pair(image_left: NDArray[np.uint8], image_right: NDArray[np.uint8]) -
 
 
 def with_disparity(frames: FrameBatch, needed: Tensor | None = None) -> FrameBatch:
-    """The frames with the disparity that they bring, or else with that of `match_disparity`.
+    """The frames with their own disparity, or else with disparity from `match_disparity`.
 
     Args:
         frames: F frames; the images pass through the CPU as 8-bit images.
-        needed: numbers of the frames to match, in any order and number; the others get NaN. None: all.
+        needed: numbers of the frames to match, in any order and number; other frames get NaN. None means all.
     """
     if frames.disparity is not None:
         return frames

@@ -1,8 +1,8 @@
-"""Where patches of one image are in another: robust Gauss-Newton (Lucas and Kanade, 1981), free of gain and offset.
+"""Robust Gauss-Newton (Lucas and Kanade, 1981) finds patches of one image in another, for any gain and offset.
 
-Semi-global matching leans towards whole pixels by up to 0.2 px. A rig's bias is of that size, and what uses the bias
-afterwards is a direct photometric method, so it is measured photometrically here. The row is free too: with rows off by
-a few tenths of a pixel (KITTI), slanted texture would turn the row offset into disparity.
+Semi-global matching is biased towards whole pixels by up to 0.2 px. A rig's bias is as large, and a direct photometric
+method uses it afterwards, so it is measured photometrically here. The row is free, too: with rows off by a few tenths
+of a pixel (KITTI), slanted texture would turn the row offset into disparity.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ _CONVERGED_PX = 0.02
 
 
 class PatchLimits(NamedTuple):
-    """Size of the patches, and what a reliable alignment is."""
+    """`PatchLimits` say how large patches are and which alignments are reliable."""
 
     radius_px: int  # patches are 2 radius + 1 pixels wide
-    change_px: float  # from the start at most, in u and in v
-    # Standard deviations of u and v at most, for residuals of one grey level; a weaker patch says little.
+    change_px: float  # largest change from the start, in u and in v
+    # largest standard deviations of u and v, for residuals of one grey level; a weaker patch says little
     sigma_px: tuple[float, float]
 
 
@@ -47,7 +47,7 @@ def align_patches(
     """Align a patch round each pixel with the other image.
 
     Returns:
-        pixels (P, 2) in the other image, and (P,) bool: converged near the start, textured, inside of both images.
+        Pixels (P, 2) in the other image, and (P,) bool: converged near the start, textured, inside of both images.
     """
     offsets = torch.arange(-limits.radius_px, limits.radius_px + 1, dtype=uv.dtype, device=uv.device)
     patch = torch.stack(torch.meshgrid(offsets, offsets, indexing="xy"), dim=-1).reshape(-1, 2)
@@ -77,7 +77,7 @@ def _solve_displacement(
     centred: Tensor,  # (P, N)
     weight: Tensor,  # (P, N)
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Least squares for displacement, offset and gain: step (P, 2), its unit variance (P, 2), residual after it."""
+    """Solve for displacement, offset and gain; return the step (P, 2), its unit variance (P, 2) and new residuals."""
     J = torch.cat([J_residual_displacement, torch.ones_like(centred)[..., None], centred[..., None]], dim=-1)
     weighted = J * weight[..., None]
     # The floor keeps patches without texture solvable; they are rejected by their variance.
@@ -88,7 +88,7 @@ def _solve_displacement(
 
 
 class RefinedDisparity(NamedTuple):
-    """Disparities after photometric refinement."""
+    """A `RefinedDisparity` holds disparities after photometric refinement."""
 
     disparity: Tensor  # (P,) pixels
     row_shift: Tensor  # (P,) v_left - v_right, pixels
@@ -96,7 +96,7 @@ class RefinedDisparity(NamedTuple):
 
 
 class MatchedPair(NamedTuple):
-    """A rectified pair with its semi-global disparity, from which patches are aligned."""
+    """A `MatchedPair` is a rectified pair with its semi-global disparity, from which patches are aligned."""
 
     grey_left: Tensor  # (H, W) grey levels 0..255
     grey_right: Tensor  # (H, W)
@@ -108,7 +108,7 @@ class MatchedPair(NamedTuple):
         image_left: NDArray[np.uint8],  # (H, W, 3) RGB
         image_right: NDArray[np.uint8],  # (H, W, 3)
     ) -> Self:
-        """Match two images, float64; raises as `match_disparity`."""
+        """Match two images in float64; it raises the errors of `match_disparity`."""
         matched = torch.from_numpy(match_disparity(image_left, image_right)).double()
         images = (torch.from_numpy(np.ascontiguousarray(image)) for image in (image_left, image_right))
         left, right = (grey_levels(image.permute(2, 0, 1).double()[None] / 255)[0] for image in images)
@@ -120,7 +120,7 @@ class MatchedPair(NamedTuple):
         disparity: Tensor,  # (P,) start, pixels
         row_shift: Tensor,  # (P,) start of v_left - v_right, pixels
     ) -> RefinedDisparity:
-        """Align a 9 x 9 patch round each left pixel with the right image, robustly, free of gain and offset."""
+        """Align a 9 x 9 patch round each left pixel with the right image, robustly, for any gain and offset."""
         start = uv_left - torch.stack([disparity, row_shift], dim=-1)
         uv_right, reliable = align_patches(self.grey_left, self.grey_right, uv_left, start, _OF_DISPARITY)
         disparity, row_shift = (uv_left - uv_right).unbind(dim=-1)
@@ -130,7 +130,7 @@ class MatchedPair(NamedTuple):
         self,
         uv_left: Tensor,  # (P, 2) whole pixels, float64, where a disparity is known
     ) -> Tensor:  # (Q, 4)
-        """Those of the pixels whose patches could be aligned: u, v, disparity, row shift."""
+        """The pixels whose patches could be aligned: u, v, disparity, row shift."""
         start = self.matched[uv_left[:, 1].long(), uv_left[:, 0].long()]
         found = self.aligned(uv_left, start, torch.zeros_like(start))
         return torch.cat([uv_left, torch.stack(found[:2], dim=1)], dim=1)[found.reliable]

@@ -1,4 +1,4 @@
-"""Ground plane of a stereo frame: RANSAC and weighted least squares on the points of the road."""
+"""This module fits the ground plane of a stereo frame to points of the road, by RANSAC and weighted least squares."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def estimate_ground_plane(
 ) -> tuple[Tensor, Tensor] | None:
     """Plane `normal . x_cam + offset = 0` of the road, from the lower half of the disparity map.
 
-    The camera's disparity field is taken off first: half a pixel lifts the road by 4 cm at 20 m. The same seed of the
-    hypotheses gives the same plane.
+    The camera's disparity field is taken off first, because half a pixel lifts the road by 4 cm at 20 m. Equal seeds of
+    the hypotheses give equal planes.
 
     Returns:
-        normal (3,), pointing up, and offset (), metres, float64; None where no plane that a road can have (within 10
-        degrees of level, 1 to 3 m below the camera) has enough support.
+        The normal (3,), pointing up, and the offset (), metres, float64; None where no plane that a road can have
+        (within 10 degrees of level, 1 to 3 m below the camera) has enough support.
     """
     if camera.num_frames != 1:
         raise InputError("camera", "the camera of one frame", f"{camera.num_frames} frames")
@@ -63,9 +63,9 @@ def fit_ground_plane(
     points_cam: Tensor,  # (P, 3) metres
     seed: int = 0,
 ) -> tuple[Tensor, Tensor] | None:
-    """Dominant plane of a road among points, each depth counting alike (near pixels are many).
+    """Dominant plane of a road among points, where all depths count alike although near pixels are many.
 
-    Returns as `estimate_ground_plane`.
+    The result is as in `estimate_ground_plane`.
     """
     generator = torch.Generator().manual_seed(seed)
     points = _road_candidates(points_cam.double(), generator)
@@ -80,7 +80,7 @@ def fit_ground_plane(
         return None
     for _ in range(_NUM_REFITS):
         inlier = (points[:, 1] - design @ model).abs() < tolerance
-        # Depth noise grows with z^2, but the height of a road pixel only with z; weights 1 / tolerance^2.
+        # Depth noise grows with z^2, but the height of a road pixel only with z, so weights are 1 / tolerance^2.
         w = weight * inlier / tolerance**2
         normal_matrix = design.T @ (w[:, None] * design) + 1e-12 * torch.eye(3, dtype=torch.float64)
         model = torch.linalg.solve(normal_matrix, design.T @ (w * points[:, 1]))
@@ -113,7 +113,7 @@ def _best_hypothesis(
     tolerance: Tensor,  # (P,)
     generator: torch.Generator,
 ) -> Tensor | None:  # (3,)
-    """The plausible plane through three points that most points agree with; drawn by weight, so far ones count."""
+    """The plausible plane through three points that most points agree with; draws by weight let far ones count."""
     index = torch.multinomial(weight, 3 * _NUM_HYPOTHESES, replacement=True, generator=generator).reshape(-1, 3)
     triple = design[index]
     solvable = torch.linalg.det(triple).abs() > 1e-3
@@ -130,7 +130,7 @@ def _best_hypothesis(
 
 
 def _plausible_plane(model: Tensor) -> tuple[Tensor, Tensor] | None:
-    """`y = a x + b z + c` as unit normal (a, -1, b) and offset c, if a road can lie so."""
+    """The plane `y = a x + b z + c` as unit normal and offset, if a road can have it, else None."""
     normal = torch.stack([model[0], -torch.ones_like(model[0]), model[1]])
     length = normal.norm()
     normal, offset = normal / length, model[2] / length
