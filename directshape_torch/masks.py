@@ -1,4 +1,4 @@
-"""Instance masks as crops: of each mask only the box around what is not zero is kept."""
+"""This module keeps instance masks as crops: of each mask only the box around the non-zero pixels is kept."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from directshape_torch.numerics.conversion import Given, as_tensor
 from directshape_torch.numerics.records import Dense, TensorRecord
 
 MASK_THRESHOLD = 0.5
-"""Foreground probability above which an instance covers a pixel."""
+"""An instance covers a pixel where its foreground probability is above this threshold."""
 
 Masks = Union[Tensor, NDArray[Any], Sequence[Tensor | NDArray[Any] | None], "MaskCrops"]
-"""Masks of B instances as users have them: (B, H, W), B entries that are (H, W) or None, or crops."""
+"""Users give masks of B instances as (B, H, W), as B entries that are (H, W) or None, or as crops."""
 
 # Resampling by cubic kernels overshoots by a quarter at an edge; logits and 0..255 go far beyond.
 _LOWEST_PROBABILITY, _HIGHEST_PROBABILITY = -0.5, 1.5
@@ -30,7 +30,7 @@ _LOWEST_PROBABILITY, _HIGHEST_PROBABILITY = -0.5, 1.5
 
 @dataclass(frozen=True)
 class MaskCrops(TensorRecord):
-    """The masks of B instances in images of one size; outside of its box a mask is zero.
+    """`MaskCrops` are the masks of B instances in images of one size; outside of its box a mask is zero.
 
     Attributes:
         values: (P,) the pixels of all boxes, row by row, one box after the other; bool or foreground probability.
@@ -63,14 +63,14 @@ class MaskCrops(TensorRecord):
 
     @classmethod
     def of(cls, masks: Masks, present: Given | None = None, name: str = "masks") -> Self:
-        """Crops of masks as users have them.
+        """Crops of masks in any form that users have.
 
         Args:
             masks: (B, H, W) or B entries that are (H, W) or None, tensors or numpy arrays, or crops: bool, uint8 (0 and
                 1 where nothing in the array is larger, else 0..255), or foreground probability. Masks that require
-                gradients are kept whole, for zeros have one too.
-            present: (B,) bool, masks that are there; the others are not read. None: all of them are there.
-            name: of the argument, for errors.
+                gradients are kept whole, because zeros have gradients, too.
+            present: (B,) bool, which masks are there; other masks are not read. None means that all are there.
+            name: name of the argument, for errors.
 
         Raises:
             InputError: no masks of one size, another dtype, or values above 1.5.
@@ -96,14 +96,14 @@ class MaskCrops(TensorRecord):
     def of_boxes(
         cls, crops: Sequence[tuple[Given, Tensor | NDArray[Any]]], size_hw: tuple[int, int], like: Tensor
     ) -> Self:
-        """Masks that are known inside of boxes alone, as mask heads give them.
+        """Crops of masks that are known inside of boxes alone, as mask heads give them.
 
         Args:
-            crops: of each instance the box u0, v0, u1, v1, half open, whole pixels within the image, and the mask
-                (v1 - v0, u1 - u0) in it, of the dtypes that `of` takes; a box without an area for an instance without a
-                mask.
+            crops: for each instance the box u0, v0, u1, v1, half open, whole pixels within the image, and the mask
+                (v1 - v0, u1 - u0) inside, of the dtypes that `of` takes; an instance without a mask has a box without
+                an area.
             size_hw: height and width of the images, pixels.
-            like: gives dtype, in floating point where a mask is soft, and device.
+            like: a tensor of the wanted device and dtype, which is floating point where a mask is soft.
 
         Raises:
             InputError: a box that leaves the image or is not in whole pixels, a mask of another size than its box,
@@ -129,7 +129,7 @@ class MaskCrops(TensorRecord):
     def _checked(
         cls, name: str, parts: Sequence[Tensor], boxes: list[list[int]], size_hw: tuple[int, int], like: Tensor
     ) -> Self:
-        """Crops of the pixels in B boxes; raises `InputError` where they are other numbers than probabilities."""
+        """Make crops of the pixels in B boxes; raise `InputError` where numbers are no probabilities."""
         values = torch.cat([part.reshape(-1) for part in parts]) if parts else like.new_zeros(0)
         crops = cls(values, torch.tensor(boxes, dtype=torch.int64, device=like.device).reshape(-1, 4), size_hw)
         if values.dtype != torch.bool and values.numel():
@@ -145,7 +145,7 @@ class MaskCrops(TensorRecord):
 
     @classmethod
     def none(cls, count: int, size_hw: tuple[int, int], like: Tensor) -> Self:
-        """No mask for so many instances, with the dtype and device of `like`."""
+        """Crops of `count` instances without masks, with the dtype and device of `like`."""
         return cls(like.new_zeros(0), torch.zeros(count, 4, dtype=torch.int64, device=like.device), size_hw)
 
     def __len__(self) -> int:
@@ -164,7 +164,7 @@ class MaskCrops(TensorRecord):
         """The pixels (h, w) of one mask inside its box."""
         row = range(len(self))[row]
         u0, v0, u1, v1 = self._boxes[row]
-        # Made anew each time: a view that is kept from a region without gradients would have none later.
+        # The view is made anew each time, because a view from a region without gradients would have none later.
         return self.values.narrow(0, self._starts[row], (v1 - v0) * (u1 - u0)).view(v1 - v0, u1 - u0)
 
     def dense(self) -> Tensor:
@@ -188,14 +188,14 @@ class MaskCrops(TensorRecord):
         return type(self)(values, self.boxes.index_select(0, index.to(self.boxes.device)), self.size_hw)
 
     def where(self, present: Tensor) -> Self:
-        """The masks where `present` (B,) holds; the other instances have none."""
+        """The masks where `present` (B,) holds; other instances have no mask."""
         check_shape("present", present, (len(self),), kind="flags")
         parts = [self.crop(row).view(-1) for row, here in enumerate(present.tolist()) if here]
         values = torch.cat(parts) if parts else self.values[:0]
         return type(self)(values, self.boxes * present[:, None].to(self.boxes), self.size_hw)
 
     def padded(self, size_hw: tuple[int, int]) -> Self:
-        """The same masks in images that are padded at the right and bottom."""
+        """The masks in images that are padded at the right and bottom."""
         return type(self)(self.values, self.boxes, size_hw)
 
     @classmethod
@@ -215,12 +215,12 @@ class MaskCrops(TensorRecord):
 
     @property
     def extents(self) -> Tensor:
-        """Boxes (B, 4) int64 around the pixels above one half, half open, 0 without any; NaN counts as above."""
+        """Boxes (B, 4) int64 around the pixels above one half or NaN, half open, 0 without any."""
         return self._foreground[0]
 
     @property
     def areas(self) -> Tensor:
-        """Numbers (B,) of pixels above one half; NaN counts as above."""
+        """Numbers (B,) of pixels above one half or NaN."""
         return self._foreground[1]
 
     @cached_property
@@ -248,16 +248,16 @@ class MaskCrops(TensorRecord):
 
 def _extents(
     crops: Sequence[Tensor],  # B of (h, w)
-    corners: Tensor,  # (B, 2) u and v of the upper left pixel of each
+    corners: Tensor,  # (B, 2) u and v of the upper left pixel of each crop
 ) -> Tensor:
-    """Boxes (B, 4) int64 around what is not zero, half open, 0 without any."""
+    """Boxes (B, 4) int64 around non-zero pixels, half open, 0 without any."""
     u0, u1 = _first_and_end([_any(crop, 0) for crop in crops], corners[:, 0])
     v0, v1 = _first_and_end([_any(crop, 1) for crop in crops], corners[:, 1])
     return torch.stack([u0, v0, u1, v1], dim=1)
 
 
 def _any(mask: Tensor, dim: int) -> Tensor:
-    """`mask.any(dim)`, which PyTorch takes seven times longer for than for the largest of bytes."""
+    """The result of `mask.any(dim)`, by the maximum of bytes, which is seven times as fast."""
     if mask.dtype != torch.bool or not mask.shape[dim]:
         return mask.any(dim=dim)
     return mask.view(torch.uint8).amax(dim=dim).bool()
@@ -267,7 +267,7 @@ def _first_and_end(
     flags: Sequence[Tensor],  # B of (L,)
     start: Tensor,  # (B,)
 ) -> tuple[Tensor, Tensor]:
-    """Position (B,) of the first True of each row, and behind its last one, from `start` on; 0 and 0 without any."""
+    """Positions (B,) of the first True of each row and behind the last one, from `start` on; 0 and 0 without any."""
     every = torch.cat(list(flags))
     lengths = torch.tensor([len(part) for part in flags], device=every.device)
     owner = torch.arange(len(lengths), device=every.device).repeat_interleave(lengths, output_size=len(every))
@@ -280,9 +280,9 @@ def _first_and_end(
 
 
 def _flags(name: str, present: Given, count: int) -> Tensor:
-    """Which masks (B,) are there."""
+    """Flags (B,) that say which masks are there."""
     flags = as_tensor(present)
-    # An empty list says nothing of its dtype.
+    # An empty list has no dtype of its own.
     flags = flags.bool() if isinstance(flags, Tensor) and flags.shape == (0,) else flags
     check_shape(f"has_{name}", flags, (count,), kind="flags")
     return flags
@@ -310,15 +310,15 @@ def _entries(name: str, masks: Tensor | Sequence[Tensor | NDArray[Any] | None]) 
 
 
 def _check_mask(name: str, mask: Tensor, shape: Sequence[int | str], cure: str = "") -> None:
-    """Raise `InputError` unless this is a mask, of bytes or of what a mask may be in a call."""
+    """Raise `InputError` unless `mask` is a mask of bytes or of a dtype that masks may have in a call."""
     is_bytes = isinstance(mask, Tensor) and mask.dtype == torch.uint8
     check_shape(name, mask, shape, cure, "number" if is_bytes else "mask")
 
 
 def _foreground(masks: Sequence[Tensor], together: bool = False) -> list[Tensor]:
-    """Masks in bytes, 0 and 1 or shades of grey, as bool or probabilities; others as they are.
+    """The masks with bytes turned into bool (0 and 1) or probabilities (shades of grey).
 
-    `together`: shades of grey in one of them say that all have some.
+    `together` says that all masks have shades of grey where one has.
     """
     of_bytes = [mask for mask in masks if mask.dtype == torch.uint8]
     has_shades = torch.stack([(mask > 1).any() for mask in of_bytes]).tolist() if of_bytes else []
@@ -337,7 +337,7 @@ def _whole_boxes(boxes: Sequence[Given]) -> list[list[int]]:
     tensors = [as_tensor(box) for box in boxes]
     for row, tensor in enumerate(tensors):
         check_shape(f"crops[{row}]", tensor, (4,), "give its box u0, v0, u1, v1 first")
-    # One wait for the device for all of them.
+    # One wait for the device serves all boxes.
     numbers = torch.stack([tensor.double() for tensor in tensors]).tolist() if tensors else []
     for row, (u0, v0, u1, v1) in enumerate(numbers):
         if not all(number.is_integer() for number in (u0, v0, u1, v1)) or u1 < u0 or v1 < v0:
@@ -348,8 +348,8 @@ def _whole_boxes(boxes: Sequence[Given]) -> list[list[int]]:
 
 
 def _supports(masks: Sequence[Tensor]) -> list[list[int]]:
-    """Boxes u0, v0, u1, v1 around what is not zero; the whole image where gradients are asked of the zeros."""
+    """Boxes u0, v0, u1, v1 around non-zero pixels; the whole image where zeros need gradients."""
     plain = [mask for mask in masks if not mask.requires_grad]
-    # One wait for the device for all of them.
+    # One wait for the device serves all masks.
     found = iter(_extents(plain, plain[0].new_zeros(len(plain), 2, dtype=torch.int64)).tolist() if plain else [])
     return [[0, 0, mask.shape[1], mask.shape[0]] if mask.requires_grad else next(found) for mask in masks]

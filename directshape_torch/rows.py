@@ -1,8 +1,8 @@
-"""Pixels, points and what hides them, packed; and rows of residuals in blocks of one car: the layout of all sums.
+"""This module packs pixels, points and what hides them, and lays out rows of residuals in blocks of one car.
 
 Pixels are packed once, 64 of one car to a block. What a car has once (its pose, its camera's centre) is looked up per
 block and not per row, the products of a block's rows have a fixed shape, and a car that leaves the batch takes its
-blocks along without a row being moved. Tensors have the blocks at their last axis but one: (..., M, R).
+blocks along without a row being moved. The blocks are the last axis but one of tensors: (..., M, R).
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from torch import Tensor
 from directshape_torch.numerics.tensors import occurrences
 
 BLOCK = 64
-"""Rows of a block."""
-# Stands for a component of a direction that is zero.
+"""A block has this many rows."""
+# This number replaces components of directions that are nearer to 0.
 _LEAST_DIRECTION = 1e-12
 
 
 @dataclass(frozen=True)
 class PixelSamples:
-    """P pixels of one image side, sorted by object."""
+    """`PixelSamples` are P pixels of one image side, sorted by object."""
 
     object_index: Tensor  # (P,) ascending
     uv: Tensor  # (P, 2) pixels
@@ -33,13 +33,13 @@ class PixelSamples:
     foreground: Tensor  # (P,) probability in [0, 1] of the mask at the pixel
     gradient_magnitude: Tensor  # (P,) grey levels per pixel
     bias_px: Tensor  # (P,) residual disparity at the (corresponding) left pixel, zero without a field
-    vertical_px: Tensor  # (P,) residual row offset there, zero without a field
+    vertical_px: Tensor  # (P,) residual row offset at the (corresponding) left pixel, zero without a field
 
     def __len__(self) -> int:
         return len(self.object_index)
 
     def select(self, index: Tensor) -> PixelSamples:
-        """The pixels of the numbers (Q,), in that order."""
+        """The pixels with the numbers (Q,), in the order of the numbers."""
         return replace(self, **{f.name: getattr(self, f.name).index_select(0, index) for f in fields(self)})
 
     def of_objects(self, keep: Tensor) -> PixelSamples:
@@ -51,7 +51,7 @@ class PixelSamples:
 
 @dataclass(frozen=True)
 class PointSamples:
-    """P points of B cars, sorted by object."""
+    """`PointSamples` are P points of B cars, sorted by object."""
 
     object_index: Tensor  # (P,) ascending
     points_cam: Tensor  # (P, 3) metres
@@ -66,16 +66,16 @@ class PointSamples:
 
 @dataclass(frozen=True)
 class OcclusionMap:
-    """What covers each pixel of one image side, foremost instances first.
+    """An `OcclusionMap` says how far in front the foremost instance at each pixel of one image side is.
 
-    There are two numbers, for instances of known and of unknown depth: the depth, metres, and less the lower edge of
-    the left 2D box, pixels.
+    There are two numbers: the depth, metres, for instances of known depth, and minus the lower edge of the left 2D box,
+    pixels, for other instances.
     """
 
-    # (B, 6) integer, of each object: u0, v0, u1, v1 of what all masks cover, half open; the entry of `covering` that
-    # pixel (0, 0) of its frame would have; entries from one row of pixels to the next
+    # (B, 6) integer, for each object: u0, v0, u1, v1 of the box around all masks, half open; the entry of `covering`
+    # that pixel (0, 0) of the frame would have; the number of entries from one row of pixels to the next
     crop: Tensor
-    in_front: Tensor  # (B, 2) what an instance must be below to be in front of each object
+    in_front: Tensor  # (B, 2) numbers below which an instance is in front of each object
     covering: Tensor  # (A, 2) least numbers of the instances that cover each pixel, infinity where none does
 
     def at(
@@ -83,9 +83,9 @@ class OcclusionMap:
         object_index: Tensor,  # (...)
         uv: Tensor,  # (..., 2)
     ) -> Tensor:
-        """Whether (...) an instance in front of the object covers the pixel next to each point; NaN is not hidden."""
+        """Whether (...) an instance in front of the object covers the pixel next to each point; NaN is never hidden."""
         if uv.is_floating_point():
-            # Far beyond any image, but within the integers.
+            # The bound is far beyond any image, but within the integers.
             uv = uv.round().nan_to_num(nan=-1.0, posinf=-1.0, neginf=-1.0).clamp(-1.0, 2.0**30)
         u, v = uv.long().unbind(-1)
         u0, v0, u1, v1, first, step = self.crop[object_index].unbind(-1)
@@ -95,13 +95,13 @@ class OcclusionMap:
 
 
 class Blocks(NamedTuple):
-    """M blocks of B cars, a car's not necessarily side by side.
+    """`Blocks` are M blocks of B cars; the blocks of a car may lie apart.
 
-    The host knows how many blocks each car has, so that leaving cars out makes it wait for nothing.
+    The host knows how many blocks each car has, so that it need not wait for the device when cars are left out.
     """
 
     owner: Tensor  # (M,) car of each block
-    counts: tuple[int, ...]  # (B,) of each car
+    counts: tuple[int, ...]  # (B,) number of blocks of each car
 
     @classmethod
     def one_each(cls, num_cars: int, device: torch.device) -> Blocks:
@@ -110,16 +110,16 @@ class Blocks(NamedTuple):
 
     @classmethod
     def join(cls, parts: Sequence[Blocks]) -> Blocks:
-        """Blocks of the same cars, those of the parts one after the other."""
+        """The blocks of all parts, which belong to the same cars, one part after the other."""
         counts = tuple(map(sum, zip(*(part.counts for part in parts), strict=True)))
         return cls(torch.cat([part.owner for part in parts]), counts)
 
     def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> tuple[Blocks, Tensor]:
-        """The blocks of the cars where `keep` (B,) holds, renumbered, and which (R,) of the blocks they are.
+        """The blocks of the cars where `keep` (B,) holds, renumbered, and their numbers (R,) among all blocks.
 
         Args:
             keep: (B,) bool.
-            numbers: where it holds, as the host knows it.
+            numbers: where `keep` holds, as the host knows it.
         """
         counts = tuple(self.counts[number] for number in numbers)
         kept = torch.nonzero_static(keep[self.owner], size=sum(counts))[:, 0]
@@ -128,11 +128,11 @@ class Blocks(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """How packed rows, sorted by car, fill blocks."""
+    """`Rows` say how packed rows, sorted by car, fill blocks."""
 
     blocks: Blocks
     row: Tensor  # (M, 64) row in each place; an empty place repeats a row of its own car
-    filled: Tensor  # (M, 64) bool
+    filled: Tensor  # (M, 64) bool, which places are filled
     num_rows: int
 
     @classmethod
@@ -165,14 +165,14 @@ class Rows(NamedTuple):
 
 
 class CarSums(NamedTuple):
-    """The order in which the blocks of each car are added: sums are the same to the bit whatever other cars have."""
+    """`CarSums` fix the order in which blocks of a car are added: its sum keeps every bit whatever other cars have."""
 
     by_car: Tensor  # (M,) blocks of the first car in order, then of the second, ...
-    first: Tensor  # (B,) where those of each car begin
+    first: Tensor  # (B,) where the blocks of each car begin
 
     @classmethod
     def of(cls, owner: Tensor, num_cars: int) -> CarSums:
-        """The order of blocks whose cars (M,) these are.
+        """The order of blocks that belong to the cars `owner` (M,).
 
         Examples:
             >>> CarSums.of(torch.tensor([0, 2, 0]), 3)
@@ -190,17 +190,17 @@ class CarSums(NamedTuple):
         """
         weight = None if weight is None else weight[self.by_car]
         flat = table[:, None] if table.ndim == 1 else table.flatten(1)
-        # A lookup in a table of rows, which are added as they are read: nothing but the sums is written.
+        # This lookup in a table adds rows as it reads them, and writes only the sums.
         sums = torch.nn.functional.embedding_bag(self.by_car, flat, self.first, mode="sum", per_sample_weights=weight)
         return sums.view(len(self.first), *table.shape[1:])
 
 
 class Rays(NamedTuple):
-    """Rays of blocks in the left camera's frame; each block has one camera and one car."""
+    """`Rays` are the rays of blocks in the left camera's frame; each block has one camera and one car."""
 
     owner: Tensor  # (M,) car
-    centre_cam: Tensor  # (M, 3) of the pixels' own camera, metres
-    ray_cam: Tensor  # (3, M, R) of unit depth in that camera
+    centre_cam: Tensor  # (M, 3) centre of the pixels' own camera, metres
+    ray_cam: Tensor  # (3, M, R) directions of unit depth in the pixels' own camera
 
     @classmethod
     def of_rows(cls, rows: Rows, centre_cam: Tensor, ray_cam: Tensor) -> Rays:
@@ -213,8 +213,8 @@ class Rays(NamedTuple):
 
     def in_objects(self, T_obj_cam: Tensor) -> ObjectRays:
         """The rays in the frames of their cars, by the poses (B, 4, 4) of the cars."""
-        # Columns of R and the translation, (3, M, 1) each. One coordinate after the other in memory: what is made of
-        # them lies likewise, and else each operation would go through it in runs of 64.
+        # These are the columns of R and the translation, (3, M, 1) each. Each coordinate is contiguous in memory, and
+        # so are results; otherwise each operation would go through memory in runs of 64.
         x_axis, y_axis, z_axis, moved = T_obj_cam[self.owner, :3].permute(2, 1, 0).contiguous()[..., None].unbind(0)
         (cx, cy, cz), (x, y, z) = self.centre_cam.mT[..., None].unbind(0), self.ray_cam.unbind(0)
         centre = torch.addcmul(torch.addcmul(torch.addcmul(moved, x_axis, cx), y_axis, cy), z_axis, cz)
@@ -223,7 +223,7 @@ class Rays(NamedTuple):
 
 
 class ObjectRays(NamedTuple):
-    """Rays in the frame of their car: `point_obj = centre + depth * direction`, depth in the ray's own camera."""
+    """`ObjectRays` are rays in their car's frame: `point_obj = centre + depth * direction`, depth in their camera."""
 
     centre_obj: Tensor  # (3, M, 1) metres
     direction_obj: Tensor  # (3, M, R) per metre of depth
@@ -241,7 +241,7 @@ class ObjectRays(NamedTuple):
         return along / (self.direction_obj * self.direction_obj).sum(0)
 
     def interval(self, bounds_obj: Tensor) -> Interval:
-        """Where the rays are inside bounds (2, 3), in front of their camera."""
+        """The depths between which rays are inside bounds (2, 3) and in front of their camera."""
         direction = self.direction_obj
         inverse = 1 / torch.copysign(direction.abs().clamp_min(_LEAST_DIRECTION), direction)
         to_lower, to_upper = (bounds_obj[..., None, None] - self.centre_obj) * inverse
@@ -253,10 +253,10 @@ class ObjectRays(NamedTuple):
 
 
 class Interval(NamedTuple):
-    """Where rays (M, R) are inside bounds; depths of those that miss them mean nothing, but are finite."""
+    """An `Interval` says where rays (M, R) are inside bounds; rays that miss have finite depths without meaning."""
 
     near: Tensor  # (M, R) metres of depth
     far: Tensor  # (M, R)
     hit: Tensor  # (M, R) bool
     enters: Tensor  # (3, M, R) depth at which the ray comes between the two bounds of each axis
-    leaves: Tensor  # (3, M, R) and goes
+    leaves: Tensor  # (3, M, R) depth at which the ray leaves the space between the two bounds of each axis
