@@ -1,6 +1,6 @@
-"""What a refinement is given: frames and detections, as plain tensors.
+"""This module holds what a refinement is given: frames and detections, as plain tensors.
 
-Knows no data set and no solver. Frames of a call are numbered `0 .. F-1`; objects carry the number of their frame.
+It knows no data set and no solver. Frames of a call are numbered `0 .. F-1`; objects carry the number of their frame.
 Everything is in the left camera frame (`cam`): x right, y down, z forward, metres; pixels are (u, v) = (column, row)
 with the centre of the top-left pixel at (0, 0).
 """
@@ -35,20 +35,20 @@ from directshape_torch.numerics.records import Dense, TensorRecord
 
 Side = Literal["left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
-"""The two images of a frame."""
+"""A frame has these two images."""
 
 # Resampling by cubic kernels overshoots by a quarter at an edge; normalised images and 0..255 go far beyond.
 _BRIGHTEST = 1.5
 _DARKEST = -0.5
-# What times and places of a path must be told apart by.
+# Times and places of a path must be exact to these steps.
 _FINE_S, _FINE_M = 1e-3, 0.01
 MOST_TELLING = 100
-"""Cars of a frame that checks and rigs look at."""
+"""Checks and rigs look at this many cars of a frame at most."""
 
 
 @dataclass(frozen=True)
 class FrameBatch(TensorRecord):
-    """F stereo frames, padded at the right and bottom to one size.
+    """A `FrameBatch` is F stereo frames, padded at the right and bottom to one size.
 
     Attributes:
         images_left: (F, 3, H, W), RGB in [0, 1].
@@ -58,13 +58,13 @@ class FrameBatch(TensorRecord):
         ground: a ground plane for each frame, in the left camera frame.
         frame_ids: a name for each frame.
         disparity: (F, H, W) measured `u_left - u_right` of the left pixels, NaN where unknown, for the methods that fit
-            a point cloud; None: they match the images themselves.
+            a point cloud; without it (None) they match the images themselves.
         points_cam: (F, P, 3) points of a LiDAR in the left camera frame, metres, NaN where a frame has fewer than P,
-            for `terms.lidar`; None: nobody has measured any.
+            for `terms.lidar`; None where there are none.
         time_s: (F,) when each frame was taken, seconds from any beginning that keeps them small; with `track_id` a car
-            then moves along a smooth path (docs/tracks.md). None: not known, and each frame is by itself.
-        T_world_cam: (F, 4, 4) pose of the left camera in a world that is the same for all frames of a track; near its
-            origin, for float32 has seven digits. None: not known, and paths are those relative to the camera.
+            then moves along a smooth path (docs/tracks.md). None where times are unknown: each frame is by itself.
+        T_world_cam: (F, 4, 4) pose of the left camera in one world for all frames of a track, which must be near the
+            origin, because float32 has seven digits. None where poses are unknown: paths are relative to the camera.
     """
 
     images_left: Annotated[Tensor, Dense("F", 3, "H", "W", kind="image", cure="stack images as (F, 3, H, W) in [0, 1]")]
@@ -113,15 +113,15 @@ class FrameBatch(TensorRecord):
     ) -> FrameBatch:
         """Frames without padding, of RGB images in floating point in [0, 1] or uint8.
 
-        All follow the left images, camera, ground, times and poses too, to their device and their dtype. That is
-        float64 for tensors of float64, else float32: for arrays, bytes and half precision too.
+        All inputs, also camera, ground, times and poses, are moved to the device and the dtype of the left images. The
+        dtype is float64 for tensors of float64, else float32, also for arrays, bytes and half precision.
 
         Args:
             images_left, images_right: rectified pairs.
             camera: of F frames, or of one for all of them.
             ground: planes, or the height of the camera above a level road, metres.
-            frame_ids: names; default "000000" and on.
-            time_s, T_world_cam: as in the class.
+            frame_ids: names; default "000000", "000001" and so on.
+            time_s, T_world_cam: see the class.
 
         Raises:
             InputError: what the class raises.
@@ -154,7 +154,7 @@ class FrameBatch(TensorRecord):
 
 @dataclass(frozen=True)
 class Occluders(TensorRecord):
-    """M further instances (any class) that may hide cars; the detections themselves need not be repeated here.
+    """`Occluders` are M further instances (any class) that may hide cars; detections need not be repeated here.
 
     Attributes:
         frame_index: (M,) int64 or int32.
@@ -177,7 +177,7 @@ class Occluders(TensorRecord):
 
 @dataclass(frozen=True)
 class Detections(TensorRecord):
-    """B rough 3D boxes with instance masks, over all frames of a call, in any order.
+    """`Detections` are B rough 3D boxes with instance masks, over all frames of a call, in any order.
 
     Attributes:
         frame_index: (B,) int64 or int32, the frame of each object.
@@ -187,22 +187,23 @@ class Detections(TensorRecord):
         box_2d: (B, 4) left-image box (u_min, v_min, u_max, v_max), pixels.
         score: (B,) the detector's score, any scale.
         mask_left, mask_right: B masks, kept as crops; masks (B, H, W) or B of (H, W) and None are cut when they are
-            given (`MaskCrops.of`). They are 0 beyond the frame's own size, for extents and areas of masks count the
-            padding too. A car needs a left mask; a right one is a second opinion.
+            given (`MaskCrops.of`). Masks must be 0 in the padding of a frame, because extents and areas count it, too.
+            A car needs a left mask; a right mask adds information.
         occluders: other instances that may hide the cars, or None.
         pose_sigma: (B, 4) standard deviations of the detector's own error: along the viewing ray of the object origin
             (in the plane of the camera's x and z axes), across it in that plane, along the camera's y axis (metres),
-            and of the heading (radians). Infinity where not known. None: the settings' (`priors.pose_sigma_*`) or the
-            rig's, if any; collated with frames that have some, infinity stands for none.
+            and of the heading (radians). Infinity means unknown. None takes the values of the settings
+            (`priors.pose_sigma_*`) or the rig, if any; when collated with frames that have values, infinity replaces
+            None.
         offset_sigma_px: (B,) standard deviation of the rig's disparity at each car about its calibration, pixels of
-            full resolution; 0 where it is known. None: the rig's, else the settings' (`rig.disparity_sigma_px`);
-            collated with frames that have some, 0 stands for none.
+            full resolution; 0 where it is known. None takes the values of the rig, else of the settings
+            (`rig.disparity_sigma_px`); when collated with frames that have values, 0 replaces None.
         track_id: (B,) int64 or int32: detections of one number are views of one car in several frames, which get one
-            shape (docs/tracks.md); below 0: a car by itself. None: all of them are.
+            shape (docs/tracks.md); a number below 0 is a car by itself. None means that every car is by itself.
         convention: how the boxes were written before they became poses and dimensions; messages use its words.
 
     Raises:
-        InputError: wrong shapes or types, a rotation that is none, dimensions or standard deviations that are not
+        InputError: wrong shapes or types, a matrix that is no rotation, dimensions or standard deviations that are not
             above 0, an `offset_sigma_px` that is below 0 or not finite, two views of one track in one frame, or masks
             of another number or with values above 1.5 (logits, 0..255).
     """
@@ -231,7 +232,7 @@ class Detections(TensorRecord):
         check_type("occluders", self.occluders, (Occluders, NoneType))
         has_pose = self.T_cam_obj.isfinite().flatten(1).all(dim=1)
         T_known = torch.where(has_pose[:, None, None], self.T_cam_obj, torch.eye(4).to(self.T_cam_obj))
-        # One wait for the device for both. Dimensions that are NaN pass: they fail their own car.
+        # One wait for the device serves both checks. NaN dimensions pass here, and fail their own car.
         if bool((is_no_rotation(T_known) | (self.dimensions_hwl <= 0).any(dim=1).to(T_known.device)).any()):
             check_rotation("T_cam_obj", T_known)
             expected = "height, width and length above 0, metres"
@@ -268,31 +269,31 @@ class Detections(TensorRecord):
         pose_sigma: Given | None = None,
         track_id: Given | None = None,
     ) -> Detections:
-        """Detections of boxes as a detector writes them, and of the masks that there are.
+        """Detections from boxes as a detector writes them, and from the masks that there are.
 
-        All numbers but the masks follow the boxes, to float32 or float64; half precision becomes float32. A refiner
-        then takes them to the dtype of the frames. Arrays and lists are taken for tensors.
+        All numbers but the masks get the dtype of the boxes, float32 or float64; half precision becomes float32. A
+        refiner then converts them to the dtype of the frames. Arrays and lists may take the place of tensors.
 
         Args:
-            boxes: x, y, z, three sizes and heading, or corners, in metres and radians; what they mean, and in which
-                order, says the convention (`directshape_torch.geometry.box_formats`).
+            boxes: x, y, z, three sizes and heading, or corners, in metres and radians; the convention says what they
+                mean and in which order they are (`directshape_torch.geometry.box_formats`).
             convention: "kitti", "mmdet3d_camera", "mmdet3d_lidar", "openpcdet", "nuscenes" or "opencv".
             mask_left, mask_right: (B, H, W) bool, uint8 (0 and 1, or 0..255) or foreground probability; or B entries
                 that are (H, W) or None; tensors or numpy arrays. Right masks may be left out, left ones not: a car
                 without a left mask is not refined.
-            has_mask_left, has_mask_right: (B,) bool, masks that are there, of which alone the pixels are read; default:
-                all of them.
+            has_mask_left, has_mask_right: (B,) bool, which masks are there; other masks are not read. By default all
+                are there.
             frame_index: (B,) default all 0.
             score: (B,) default all 1.
-            box_2d: (B, 4) u_min, v_min, u_max, v_max of the left image; default: around the left mask.
-            T_cam_boxes: rigid motion from the frame of the boxes to the left camera, (4, 4) or (B, 4, 4). Camera
-                conventions do without where the boxes are in the left camera's frame; boxes in KITTI's own frame of
-                labels bring `camera.T_cam_ref`; LiDAR boxes need camera_from_lidar.
-            occluders, pose_sigma, track_id: as in the class.
+            box_2d: (B, 4) u_min, v_min, u_max, v_max of the left image; default: the box around the left mask.
+            T_cam_boxes: rigid motion from the frame of the boxes to the left camera, (4, 4) or (B, 4, 4). Boxes
+                in the left camera's frame need none, boxes in KITTI's own frame of labels need `camera.T_cam_ref`, and
+                LiDAR boxes need camera_from_lidar.
+            occluders, pose_sigma, track_id: see the class.
 
         Raises:
-            InputError: no masks at all, LiDAR boxes without `T_cam_boxes`, one that does not take up to up (such as
-                the inverse), corners that make no box, and what the class raises.
+            InputError: no masks at all, LiDAR boxes without `T_cam_boxes`, a motion that tilts boxes over (as its
+                inverse may), corners that make no box, and what the class raises.
 
         Examples:
             >>> boxes = torch.tensor([[1.0, 0.85, 20.0, 4.0, 1.6, 1.5, 0.3]])
@@ -342,10 +343,10 @@ class Detections(TensorRecord):
         return self.mask_right.areas > 0
 
     def telling_rows(self, frame: int) -> list[int]:
-        """The cars of a frame that tell most of its rig and conventions: at most 100, in their order.
+        """The cars of a frame that tell most of its rig and conventions, at most 100, as ascending row numbers.
 
-        Cars with a left mask come first, then those of higher scores: detectors that write down whatever they have fill
-        a frame with thousands of boxes.
+        Cars with a left mask are chosen first, then cars with higher scores, because some detectors fill a frame with
+        thousands of boxes.
         """
         has_mask, score, of_frame = self.has_mask_left.tolist(), self.score.tolist(), self.frame_index.tolist()
         rows = [row for row, number in enumerate(of_frame) if number == frame]
@@ -356,7 +357,7 @@ class Detections(TensorRecord):
 
 
 def _as_images(name: str, images: Given) -> Tensor:
-    """RGB (F, 3, H, W) in [0, 1], in float32 or float64."""
+    """RGB images (F, 3, H, W) in [0, 1], in float32 or float64."""
     dtype = working_dtype(images.dtype) if isinstance(images, Tensor) else torch.float32
     images = as_tensor(images)
     shape = (3, "H", "W") if isinstance(images, Tensor) and images.ndim == 3 else ("F", 3, "H", "W")
@@ -367,13 +368,13 @@ def _as_images(name: str, images: Given) -> Tensor:
 
 
 def _cut_masks(instances: Detections | Occluders) -> None:
-    """Crops in place of the masks of a record that came in another form."""
+    """Replace the masks of a record by crops where they came in another form."""
     for name in ("mask_left", "mask_right"):
         object.__setattr__(instances, name, MaskCrops.of(getattr(instances, name), name=name))
 
 
 def _check_mask_numbers(left: MaskCrops, right: MaskCrops, count: int) -> None:
-    """Raise `InputError` unless there are so many masks in both images."""
+    """Raise `InputError` unless there are `count` masks in both images."""
     for name, masks in (("mask_left", left), ("mask_right", right)):
         if len(masks) != count:
             raise InputError(name, f"{count} masks, one for each instance", f"{len(masks)}")
@@ -393,7 +394,7 @@ def _check_motion(time_s: Tensor | None, T_world_cam: Tensor | None) -> None:
 
 
 def _check_fine(name: str, values: Tensor, fine: float, unit: str) -> None:
-    """Raise `InputError` where the numbers of a dtype are too far apart for what they are to tell."""
+    """Raise `InputError` where the numbers of a dtype are further apart than `fine`."""
     spacing = torch.finfo(values.dtype).eps * float(values.detach().abs().max()) if values.numel() else 0.0
     if spacing > fine:
         came = f"{values.dtype} {float(values.detach().abs().max()):g} {unit}, which is known to {spacing:.2g} {unit}"
@@ -413,13 +414,13 @@ def _check_tracks(
 
 
 def _check_brightness(name: str, images: Tensor) -> None:
-    """Values that are not finite are left to the refinement, which fails the cars that need them."""
+    """Raise `InputError` for values far outside of [0, 1]; values that are not finite fail the cars that need them."""
     if not images.numel():
         return
     values = images.detach()
     darkest, brightest = torch.stack(values.aminmax()).tolist()
     if not math.isfinite(brightest - darkest):
-        # One NaN hides all other values, but to copy the images for that is worth it only where there is one.
+        # One NaN hides all other values. Images are copied without NaN only where they have one.
         finite = values.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
         darkest, brightest = torch.stack(finite.aminmax()).tolist()
     if darkest < _DARKEST:
