@@ -1,7 +1,7 @@
-"""Hot tensor functions, marked `@compilable(sizes={...})`, and where `torch.compile` is put to work on them.
+"""This module marks hot tensor functions by `@compilable(sizes={...})` and compiles them by `torch.compile`.
 
 A marked function is called like any other. It is compiled inside a `compiling` region alone, which the refiner opens
-around its work by the setting `compile: auto | on | off`; what was compiled lies in PyTorch's own cache on disk.
+around its work by the setting `compile: auto | on | off`. PyTorch's own cache on disk keeps compiled code.
 """
 
 from __future__ import annotations
@@ -27,14 +27,16 @@ from directshape_torch.numerics.gradient_mode import is_plain, nothing_is_differ
 
 CompileMode = Literal["auto", "on", "off"]
 
-# Between what a start takes with compiled forms on the disk (10 s) and without (a minute), counted in what they save
-# of a car of a frame by itself (6 to 10 ms, docs/performance.md): 1000 cars and 6000 to 10 000.
+# A start takes 10 s with compiled forms on the disk and a minute without. A form saves 6 to 10 ms for a car of a frame
+# by itself (docs/performance.md), so compiling pays from 1000 cars with forms on the disk, and from 6000 to 10 000
+# without. This number lies between.
 CARS_WORTH_COMPILING = 3000
 
-# Nothing in place: PyTorch 2.13 lets an operation write over a part of a `torch.stack` too, and then gives the whole
-# stack to another while what was written is read. Indices are right by construction, and a check of each costs a
-# multiple of the arithmetic. Code that asks for the number of threads serves every setting of the user. What the
-# processor says of its vector units is believed (trying them takes seconds), and headers cost more than they save.
+# No buffer is written in place: PyTorch 2.13 also lets an operation write over a part of a `torch.stack`, and then
+# gives the whole stack to another operation while the written part is read. Indices are right by construction, and a
+# check of each costs a multiple of the arithmetic. Code that asks for the number of threads serves every setting of the
+# user. The processor's report of its vector units is trusted, because trials take seconds. Precompiled headers cost
+# more than they save.
 _OPTIONS: dict[str, str | int | bool | Callable[..., Any]] = {
     "inplace_buffers": False,
     "assert_indirect_indexing": False,
@@ -43,7 +45,7 @@ _OPTIONS: dict[str, str | int | bool | Callable[..., Any]] = {
     "cpp.vec_isa_ok": True,
     "cpp_cache_precompile_headers": False,
 }
-# Forms of one function, for other settings, fixed sizes or dtypes, before it is dropped.
+# A function with more forms than this, for other settings, fixed sizes or dtypes, is dropped.
 _MOST_FORMS = 64
 
 _logger = logging.getLogger(__name__)
@@ -54,7 +56,7 @@ _T = TypeVar("_T")
 
 @dataclass
 class _Process:
-    """What this process has done so far."""
+    """`_Process` records what this process has done so far."""
 
     lock: threading.RLock = field(default_factory=threading.RLock)
     forms: int = 0
@@ -78,12 +80,12 @@ if hasattr(os, "register_at_fork"):
 
 @contextmanager
 def compiling(mode: CompileMode) -> Iterator[None]:
-    """Region in which marked functions may be compiled.
+    """A region in which marked functions may be compiled.
 
     "on" compiles always, "off" never, and "auto" where `cars_ahead` has told of a job of at least
     `CARS_WORTH_COMPILING` cars. Without a working compiler "auto" stays plain and says so once in the log. Forked
-    processes stay plain. Inference mode becomes `no_grad` inside: its tensors would be one more compilation of
-    everything.
+    processes stay plain. Inference mode becomes `no_grad` inside, because its
+    tensors would need one more compilation of everything.
 
     Args:
         mode: the setting.
@@ -119,13 +121,14 @@ def cars_ahead(num_cars: int) -> Iterator[None]:
 def will_compile(*tensors: Tensor) -> bool:
     """Whether a marked function that is called here with tensors like these takes its compiled form.
 
-    It does not with gradients on, in forward mode, inside `torch.func`, in float64, for subclasses of tensors, under
-    autocast, under a mode that sees every operation (`FlopCounterMode`), and in the user's own `torch.compile`.
+    It takes its plain form with gradients on, in forward mode, inside `torch.func`, in float64, for subclasses of
+    tensors, under autocast, under a mode that sees every operation (`FlopCounterMode`), and in the user's own
+    `torch.compile`.
     """
-    # First of all: the user's own compilation traces the plain form.
+    # This check comes first, because the user's own compilation traces the plain form.
     if torch.compiler.is_compiling() or _mode.get() == "off" or not nothing_is_differentiated():
         return False
-    # PyTorch refuses to compile under such a mode, and has no public word for whether there is one.
+    # PyTorch refuses to compile under a mode that sees every operation, and has no public name to ask for it.
     return torch._C._len_torch_dispatch_stack() == 0 and all(map(_is_fit, tensors))
 
 
@@ -141,10 +144,10 @@ def num_forms() -> int:
 
 @functools.cache
 def compiler_problem() -> str | None:
-    """Why nothing can be compiled here, or None if it can; tried once with a function of one line."""
+    """The reason why nothing can be compiled here, or None; it is tried once with a function of one line."""
     traced: list[int] = []
     try:
-        # In a thread of its own, which has none of the caller's modes.
+        # A thread of its own has none of the caller's modes.
         with _process.lock, warnings.catch_warnings(action="ignore"), ThreadPoolExecutor(1) as thread:
             thread.submit(lambda: _compiled(lambda x: x + 1, traced.append)(torch.ones(2))).result()
     except Exception as error:  # PyTorch's compiler can raise anything, and whatever it is there is no compiler
@@ -163,13 +166,13 @@ def _can_compile(mode: CompileMode) -> bool:
 
 
 def _mark(tensor: Tensor, axis: int) -> None:
-    # A wish and no demand: code that needs a size to be what it is may have it so. `dynamic=True` in place of marks has
+    # A mark is a wish and no demand: code that needs a fixed size may fix it. `dynamic=True` in place of marks makes
     # every size vary, which takes three times as long to compile; PyTorch's guide to dynamic shapes names no other way.
     torch._dynamo.maybe_mark_dynamic(tensor, axis)
 
 
 def with_varying(value: _T, axes_of: Callable[[Tensor], Iterable[int]]) -> _T:
-    """The same tensor, named tuple or dataclass, with the axes marked whose sizes vary from call to call."""
+    """A copy of a tensor, named tuple or dataclass, with marks on the axes whose sizes vary from call to call."""
 
     def of_record(record: Any) -> Any:
         if not is_dataclass(record):
@@ -183,7 +186,7 @@ def with_varying(value: _T, axes_of: Callable[[Tensor], Iterable[int]]) -> _T:
 
 
 def _walker(of_tensor: Callable[[Tensor, str], Any], of_other: Callable[[Any], Any]) -> Callable[[Any, str], Any]:
-    """Makes of nested tuples and named tuples the same of what becomes of each tensor, by its name, and of the rest."""
+    """A function that copies nested tuples, with `of_tensor` for each tensor and its name, `of_other` for the rest."""
 
     def walked(value: Any, name: str) -> Any:
         if isinstance(value, Tensor):
@@ -198,7 +201,7 @@ def _walker(of_tensor: Callable[[Tensor, str], Any], of_other: Callable[[Any], A
 
 
 def _with_marks(tensor: Tensor, axes: Iterable[int]) -> Tensor:
-    """A contiguous tensor without gradient, and an object of its own: a mark must not stay on the caller's."""
+    """A contiguous tensor without gradient, which is a new object, so that no mark stays on the caller's tensor."""
     tensor = (tensor.clone() if tensor.is_inference() else tensor.detach()).contiguous()
     for axis in axes:
         _mark(tensor, axis)
@@ -210,8 +213,8 @@ def compilable(sizes: Mapping[str, int]) -> Callable[[Callable[_P, _R]], Compila
 
     Inside a `compiling` region it is compiled once for all values of the named sizes, and once more for each
     combination of other sizes, dtypes, devices, numbers and strings. Calls that cannot be compiled (`will_compile`),
-    and those with a named size below 2, of which PyTorch would make a case of its own, take the plain form. A compiled
-    form that fails where the plain one does not is dropped for the rest of the process; the log says so in one line.
+    and calls with a named size below 2, which is a special case in PyTorch, take the plain form. A compiled form that
+    fails where the plain one works is dropped for the rest of the process; the log says so in one line.
 
     Args:
         sizes: dimensions whose sizes vary from call to call, by the names of arguments, or of fields of named tuples.
@@ -230,7 +233,7 @@ def compilable(sizes: Mapping[str, int]) -> Callable[[Callable[_P, _R]], Compila
 
 
 class Compilable(Generic[_P, _R]):
-    """A pure function in two forms, plain and compiled; see `compilable`."""
+    """A `Compilable` is a pure function in two forms, plain and compiled; see `compilable`."""
 
     def __init__(self, sizes: Mapping[str, int], function: Callable[_P, _R]) -> None:
         self.plain = function
@@ -255,7 +258,7 @@ class Compilable(Generic[_P, _R]):
         try:
             return self._run(prepared)
         except Exception as error:  # PyTorch's compiler can raise anything
-            # First of all: what is wrong with the arguments is raised here, and is no matter of the compiler's.
+            # The plain form comes first and raises the errors of wrong arguments, which the compiler did not cause.
             result = self.plain(*args, **kwargs)
             self._drop(error)
             return result
@@ -264,8 +267,8 @@ class Compilable(Generic[_P, _R]):
         with torch.no_grad():
             if self._has_worked and self._compiled is not None:
                 return self._compiled(*values)
-            # Threads that call at once share the first compilation. PyTorch's own deprecations, where its caller has
-            # made errors of warnings, are no reason not to compile.
+            # Threads that call at once share the first compilation. PyTorch's own deprecations must not stop it where
+            # the caller has turned warnings into errors.
             with _process.lock, warnings.catch_warnings(action="ignore"):
                 self._compiled = self._compiled or _compiled(self.plain, _count)
                 result = self._compiled(*values)
@@ -301,16 +304,16 @@ def _prepared(value: Any, name: str, sizes: Mapping[str, int]) -> Any:
     def of_other(other: Any) -> Any:
         if other is None or isinstance(other, (int, float, str)) or is_dataclass(other):
             return other
-        # What the compiler cannot look into is another one at each call.
+        # A value that the compiler cannot look into counts as a new one at each call.
         raise _StaysPlainError
 
     return _walker(of_tensor, of_other)(value, name)
 
 
 def _compiled(function: Callable[_P, _R], on_compilation: Callable[[int], None]) -> Callable[_P, _R]:
-    """By `torch.compile`, whose forms assume that functions and constants of modules stay what they are.
+    """Compile by `torch.compile`, with forms that assume that functions and constants of modules stay as they are.
 
-    What arguments and settings of PyTorch must be is checked at each call: two thirds of all checks fall away.
+    Arguments and settings of PyTorch are checked at each call; two thirds of all checks are left out.
     """
 
     def without_globals(guards: Sequence[Any]) -> list[bool]:

@@ -1,4 +1,4 @@
-"""Settings: each is defined once, by its type, default, description and allowed numbers; units are in the names.
+"""Each setting is defined once, by its type, default, description and allowed numbers; units are in the names.
 
 Checks, files, `--set key=value` and `configs/default.yaml` with its comments all follow from the fields below.
 """
@@ -17,16 +17,16 @@ from typing import Any, Literal, TypedDict, TypeVar, Unpack
 from directshape_torch.errors import ConfigError
 
 Unknowns = Literal["both", "pose", "shape"]
-"""The unknowns that a stage moves."""
+"""A stage moves these unknowns."""
 SamplingMode = Literal["adaptive", "uniform", "dense"]
-"""Which pixels of its region a car gets."""
+"""The mode says which pixels of its region a car gets."""
 
 _T = TypeVar("_T")
 _COMPARISONS = {"above": operator.gt, "at_least": operator.ge, "at_most": operator.le}
 
 
 class Limits(TypedDict, total=False):
-    """Limits of a number; of a tuple, of each entry. A name is that of a setting of the same group."""
+    """`Limits` bound a number, or each entry of a tuple. A name stands for the value of a setting of the same group."""
 
     above: float
     at_least: float | str
@@ -40,7 +40,7 @@ def setting(default: _T, description: str, **limits: Unpack[Limits]) -> _T:
 
 
 def limits_in_words(limits: Mapping[str, float | str], group: Settings | None = None) -> str:
-    """Such as "above 0 and at most 1"; of a group, with the values of its settings that are limits of others.
+    """Limits in words, as "above 0 and at most 1"; with a group, settings that are limits come with their values.
 
     Examples:
         >>> limits_in_words({"at_least": "min_pixels"}, SamplingConfig())
@@ -55,12 +55,12 @@ def limits_in_words(limits: Mapping[str, float | str], group: Settings | None = 
 
 @dataclass(frozen=True)
 class Settings:
-    """A group of settings. Making one with a value that is not allowed is a `ConfigError` that names the key."""
+    """`Settings` are a group of settings. A value that is not allowed raises a `ConfigError` that names the key."""
 
     @classmethod
     @cache
     def types(cls) -> dict[str, Any]:
-        """Of the settings by name."""
+        """The types of the settings by name."""
         return typing.get_type_hints(cls)
 
     def __post_init__(self) -> None:
@@ -281,7 +281,7 @@ class PriorConfig(Settings):
 
     @property
     def pose_sigmas(self) -> tuple[float, float, float, float, float]:
-        """Along the ray as a share of the distance, then metres, metres, metres and radians; 0 for not known."""
+        """Sigmas along the ray (share of distance, metres), across, vertical (metres), of yaw (radians); 0: unknown."""
         metres = self.pose_sigma_along_m, self.pose_sigma_across_m, self.pose_sigma_vertical_m
         return self.pose_sigma_along_share, *metres, math.radians(self.pose_sigma_yaw_deg)
 
@@ -389,7 +389,7 @@ class RefinerConfig(Settings):
         super().__post_init__()
         if not self.stages:
             raise ConfigError("stages: expected at least one stage, got none")
-        # Implicit gradients are those of the final stage, where pose and shape must both have come to rest.
+        # Implicit gradients belong to the final stage, in which both pose and shape must have settled.
         key, value, needed = "stages[-1].unknowns", str(self.stages[-1].unknowns), "both"
         if self.method == "geometric":
             key, value, needed = "point_cloud.order", self.point_cloud.order, "joint"

@@ -1,4 +1,4 @@
-"""Every error that a user can meet; all derive from `DirectShapeError`."""
+"""This module has every error that a user can meet; all derive from `DirectShapeError`."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ _LONGEST_PART = 400
 
 
 class DirectShapeError(Exception):
-    """Base of all errors raised on purpose by this package; what is too long to be read is shortened."""
+    """`DirectShapeError` is the base of all errors that this package raises on purpose; it shortens long messages."""
 
     def __init__(self, message: str = "") -> None:
         super().__init__(shortened(message, _LONGEST_MESSAGE))
 
 
 class InputError(DirectShapeError, ValueError):
-    """An argument has the wrong shape, type or value: names it, says what was expected, what came, and the cure."""
+    """An argument has a wrong shape, type or value; the message has its name, what was expected, what came, a cure."""
 
     def __init__(self, name: str, expected: str, got: str, cure: str = "") -> None:
         super().__init__(f"{name}: expected {expected}, got {shortened(got)}" + (f"; {cure}" if cure else ""))
@@ -26,7 +26,7 @@ class InputError(DirectShapeError, ValueError):
 
 
 class DataFormatError(DirectShapeError, ValueError):
-    """A file does not hold what its format demands: names file, line number and text where there is one."""
+    """A file does not hold what its format demands; the message names the file, and line number and text if known."""
 
     def __init__(
         self,
@@ -76,11 +76,11 @@ class RunInProgressError(DirectShapeError):
 
 
 class SceneWarning(UserWarning):
-    """What a refiner found wrong with images, calibration, masks or boxes (setting `check`)."""
+    """A refiner found a mistake in images, calibration, masks or boxes (setting `check`)."""
 
 
 class PriorWarning(UserWarning):
-    """The mean shape of a prior's file does not look like a car, though the file does not say that it is none."""
+    """The mean shape of a prior's file does not look like a car, though the file says that its shapes are cars."""
 
 
 class NoGradientWarning(UserWarning):
@@ -88,11 +88,11 @@ class NoGradientWarning(UserWarning):
 
 
 class CompilationError(DirectShapeError, RuntimeError):
-    """Compiled functions were asked for (`compile: on`) where they cannot be had."""
+    """Compiled functions were asked for (`compile: on`) where they are not available."""
 
 
 class MissingDependencyError(DirectShapeError, ImportError):
-    """An optional package is needed for what was asked; one that is in no extra of ours comes without `extra`."""
+    """An optional package is needed for what was asked; `extra` is empty where no extra of this package has it."""
 
     def __init__(self, package: str, extra: str, purpose: str) -> None:
         cure = f"install it with: pip install 'directshape_torch[{extra}]'" if extra else "install it as its pages say"
@@ -110,7 +110,7 @@ def shortened(text: str, most: int = _LONGEST_PART) -> str:
 
 
 class _Shown(reprlib.Repr):
-    """Also of values that are nested deeply, or that hold the same part over and over."""
+    """`_Shown` keeps texts short, also of values that are nested deeply or that hold one part over and over."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -119,4 +119,4 @@ class _Shown(reprlib.Repr):
 
 
 shown = _Shown().repr
-"""The `repr` of a value that came from a file, short whatever it is."""
+"""`shown` gives the `repr` of a value that came from a file, which is always short."""

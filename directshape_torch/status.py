@@ -1,4 +1,4 @@
-"""How the refinement of a car ended; the value is the message, with advice."""
+"""This module says how the refinement of a car ended; the value of a status is its message, with advice."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 class Status(enum.Enum):
-    """Outcome for one car. `converged` and `max_iterations` carry a refined state; all others the input's."""
+    """A `Status` is one car's outcome. `converged` and `max_iterations` carry a refined state, others the input."""
 
     converged = "refined: the cost settled, or a further step promises less than half a percent of it"
     max_iterations = (
@@ -68,12 +68,12 @@ _REFINED = [status.code for status in Status if status.is_refined]
 
 
 def is_refined(status_code: Tensor) -> Tensor:
-    """Which codes (B,) are of cars that carry a refined state."""
+    """Whether the codes (B,) belong to cars that carry a refined state."""
     return torch.stack([status_code == code for code in _REFINED]).any(dim=0)
 
 
 def counted(counts: Mapping[str, int]) -> str:
-    """How many cars ended in which way, by names of statuses: the refined ones first, for both names are successes.
+    """How many cars ended in which status, in words; refined cars come first, because both statuses are successes.
 
     Examples:
         >>> counted({"max_iterations": 1, "converged": 4, "no_mask": 2})
