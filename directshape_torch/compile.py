@@ -84,8 +84,8 @@ def compiling(mode: CompileMode) -> Iterator[None]:
 
     "on" compiles always, "off" never, and "auto" where `cars_ahead` has told of a job of at least
     `CARS_WORTH_COMPILING` cars. Without a working compiler "auto" stays plain and says so once in the log. Forked
-    processes stay plain. Inference mode becomes `no_grad` inside, because its
-    tensors would need one more compilation of everything.
+    processes stay plain. Inference mode becomes `no_grad` inside, because its tensors would need one more compilation
+    of everything.
 
     Args:
         mode: the setting.

@@ -30,7 +30,7 @@ from directshape_torch.shape.shape_prior import SdfDerivatives
 
 # This number is negligible next to any distance, and a normal number in single precision.
 _TINY = 2e-38
-# A search that begins within this distance along the ray, in cells, before a face begins behind the face. Where a search
+# A search that begins within this distance along the ray, in cells, before a face begins behind it. Where a search
 # has ended on a face, rounding therefore does not choose the cell in which the next search begins, and beside a second
 # face that cell is still one that the ray comes through.
 _ON_FACE = 1e-4
