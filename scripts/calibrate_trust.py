@@ -6,7 +6,8 @@
 DETECTIONS are a folder of result files, or `stereo` or `mono`: a detector that is simulated from labels, ten times.
 A run learns what its detector is off by from its own results, never from labels. Labels tell what the images are off by
 and, beside boxes and masks that are laid on other images, when a car is there; each draw counts as much as another.
-Each ROOT is judged by what the others have told; cars that the package refuses for want of evidence take no part.
+Each run is judged by what other roots with other detectors have told; cars that the package refuses for want of
+evidence take no part.
 Written to OUT: the draws, `report.md`, and `trust_model.json`, fitted to all.
 """
 
@@ -17,17 +18,20 @@ import pickle
 import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
 from command_line import run_command
+from numpy.typing import NDArray
 from trust_calibration.cars import Array, Cars, Judged, outcomes, probabilities, refined_cars, returned
 from trust_calibration.draws import SIMULATED, write_draws
-from trust_calibration.fit import fit_head, fit_noise
+from trust_calibration.fit import evidence_of, fit_head, fit_noise
 
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.files.atomic_files import write_text
@@ -36,6 +40,7 @@ from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.refinement.observability import CAR_QUANTITIES
 from directshape_torch.refinement.trust import WORSE_BY, TrustModel, bundled_trust_model
 
+THRESHOLDS = (0.0, 0.7, 0.8, 0.85, 0.9, 0.95)
 BINS = (0.0, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 _TO_SIGMA = 1 / 0.7407  # the median of |x| of Student's t of 4 degrees of freedom
 
@@ -69,8 +74,8 @@ def _refined(run: tuple[Path, Path, Path, str, bool], overrides: Sequence[str], 
 def fitted(runs: Sequence[Cars]) -> TrustModel:
     """The model of some runs."""
     noise = fit_noise(runs)
-    elsewhere = [run.judged(noise, elsewhere=True) for run in runs if run.elsewhere]
-    head = fit_head([run.judged(noise) for run in runs], elsewhere) if elsewhere else bundled_trust_model().car_is_there
+    there, not_there = evidence_of(runs, noise)
+    head = fit_head(there, not_there) if len(not_there) else bundled_trust_model().car_is_there
     provenance = {
         "made_by": "scripts/calibrate_trust.py",
         "cars": sum(len(frame.result) for run in runs for frame in run.frames),
@@ -84,71 +89,101 @@ def run(args: argparse.Namespace) -> None:
     """Refine, fit, judge, write."""
     args.out.mkdir(parents=True, exist_ok=True)
     runs = [run for run in runs_of(args) if run.frames]
-    roots = list(dict.fromkeys(run.root for run in runs))
-    others = roots[1:] and not args.by_frame
-    models = {root: fitted([run for run in runs if run.root != root]) for root in roots} if others else {}
+    rows = list(dict.fromkeys((run.root, run.detector) for run in runs))
+    others = {row: [run for run in runs if run.root != row[0] and run.detector != row[1]] for row in rows}
+    left_out = not args.by_frame and all(others.values())
     of_all = bundled_trust_model() if args.by_frame else fitted(runs)
+    models = {row: fitted(others[row]) if left_out else of_all for row in rows}
     of_all.save(args.out / "trust_model.json")
-    judged = {id(run): run.judged(models.get(run.root, of_all).image_noise) for run in runs}
+    judged = {row: _judged(runs, row, models[row]) for row in rows}
     own = "the package" if args.by_frame else "its own cars"
-    how = f"Each root is judged by {'what the others have told' if models else own}."
+    how = f"Each row is judged by {'what other roots with other detectors have told' if left_out else own}."
+    limits = load_config(None, args.set).acceptance
     parts = [
         how,
-        _policies(runs, judged, models, of_all, load_config(None, args.set).acceptance),
-        _reliability(runs, judged, models, of_all),
-        _coverage(runs, judged),
-        _noises({"all": of_all, **{f"without {root}": model for root, model in models.items()}}),
+        _policies(judged, limits),
+        _thresholds(judged, limits),
+        _reliability(judged),
+        _coverage(judged),
+        _noises({"all": of_all, **({"without " + " ".join(row): models[row] for row in rows} if left_out else {})}),
     ]
     write_text(args.out / "report.md", "\n\n".join(parts) + "\n")
     print("\n\n".join(parts))
 
 
-def _policies(
-    runs: Sequence[Cars],
-    judged: Mapping[int, Judged],
-    models: Mapping[str, TrustModel],
-    of_all: TrustModel,
-    limits: AcceptanceConfig,
-) -> str:
+class JudgedRow(NamedTuple):
+    """The runs of one detector on one root, one a draw, as a model sees them."""
+
+    cars: list[Judged]
+    elsewhere: list[Judged]
+    model: TrustModel
+
+    def returned(self, limits: AcceptanceConfig) -> list[NDArray[np.bool_]]:
+        """Which boxes of each run come back."""
+        return [returned(each, self.model.car_is_there, limits) for each in self.cars]
+
+    def chosen(self, limits: AcceptanceConfig) -> list[Array]:
+        """Overlaps of what comes back, run by run."""
+        pairs = zip(self.returned(limits), self.cars, strict=True)
+        return [np.where(kept, cars.after, cars.before) for kept, cars in pairs]
+
+
+Rows: TypeAlias = Mapping[tuple[str, str], JudgedRow]
+"""By root and detector."""
+
+
+def _judged(runs: Sequence[Cars], row: tuple[str, str], model: TrustModel) -> JudgedRow:
+    some, noise = [run for run in runs if (run.root, run.detector) == row], model.image_noise
+    elsewhere = [run.judged(noise, elsewhere=True) for run in some if run.elsewhere]
+    return JudgedRow([run.judged(noise) for run in some], elsewhere, model)
+
+
+def _policies(rows: Rows, limits: AcceptanceConfig) -> str:
     """What comes back, a row for each detector on each root: means over the draws, with their standard deviation."""
     head = "cars", "runs, cars", "input", "images alone (worse)", "most probable (worse)", "returned (worse, share)"
-    rows = ["| " + " | ".join((*head, "elsewhere")) + " |", "|" + "---|" * 7]
-    for root, detector in dict.fromkeys((run.root, run.detector) for run in runs):
-        some = [run for run in runs if (run.root, run.detector) == (root, detector)]
-        model = models.get(root, of_all)
-        cars = [judged[id(run)] for run in some]
-        kept = [returned(each, model.car_is_there, limits) for each in cars]
-        chosen = [np.where(k, c.after, c.before) for k, c in zip(kept, cars, strict=True)]
-        inputs = _spread([float(c.before.mean()) for c in cars])
-        cells = [_cell(cars, [c.images for c in cars]), _cell(cars, [c.after for c in cars]), _cell(cars, chosen)]
-        cells[2] = f"{cells[2][:-1]}, {np.mean([k.mean() for k in kept]):.0%})"
-        others = [run.judged(model.image_noise, elsewhere=True) for run in some if run.elsewhere]
-        there = [returned(each, model.car_is_there, limits) for each in others]
-        cells.append(f"{sum(k.sum() for k in there)} of {sum(len(k) for k in there)}" if there else "")
-        counts = f"{len(some)}, {np.mean([len(c.before) for c in cars]):.0f}"
-        rows.append(f"| {root} {detector} | {counts} | {inputs} | " + " | ".join(cells) + " |")
-    return "\n".join(rows)
+    lines = ["| " + " | ".join((*head, "elsewhere")) + " |", "|" + "---|" * 7]
+    for (root, detector), row in rows.items():
+        cars, share = row.cars, np.mean([kept.mean() for kept in row.returned(limits)])
+        inputs = _spread([float(each.before.mean()) for each in cars])
+        cells = [_cell(cars, [each.images for each in cars]), _cell(cars, [each.after for each in cars])]
+        cells.append(f"{_cell(cars, row.chosen(limits))[:-1]}, {share:.0%})")
+        there = [returned(each, row.model.car_is_there, limits) for each in row.elsewhere]
+        cells.append(f"{sum(kept.sum() for kept in there)} of {sum(map(len, there))}" if there else "")
+        counts = f"{len(cars)}, {np.mean([len(each.before) for each in cars]):.0f}"
+        lines.append(f"| {root} {detector} | {counts} | {inputs} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
 
 
-def _cell(cars: Sequence[Judged], after: Sequence[Array]) -> str:
+def _thresholds(rows: Rows, limits: AcceptanceConfig) -> str:
+    """What other limits of the probability of a box that is not worse would return."""
+    head = "returned from", *(f"{least:g}" for least in THRESHOLDS)
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for (root, detector), row in rows.items():
+        cells = []
+        for least in THRESHOLDS:
+            other = replace(limits, min_probability_not_worse=least)
+            cells.append(_cell(row.cars, row.chosen(other), with_spread=False))
+        lines.append(f"| {root} {detector} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _cell(cars: Sequence[Judged], after: Sequence[Array], with_spread: bool = True) -> str:
     worse = np.mean([(a < c.before - WORSE_BY).mean() for a, c in zip(after, cars, strict=True)])
-    return f"{_spread([float(a.mean()) for a in after])} ({100 * worse:.1f} %)"
+    means = [float(a.mean()) for a in after]
+    return f"{_spread(means) if with_spread else f'{np.mean(means):.3f}'} ({100 * worse:.1f} %)"
 
 
 def _spread(values: Sequence[float]) -> str:
     return f"{np.mean(values):.3f}" + (f" ± {np.std(values, ddof=1):.3f}" if values[1:] else "")
 
 
-def _reliability(
-    runs: Sequence[Cars], judged: Mapping[int, Judged], models: Mapping[str, TrustModel], of_all: TrustModel
-) -> str:
+def _reliability(rows: Rows) -> str:
     """Predicted beside true shares, in bins of the prediction."""
     pairs = [
-        (probabilities(judged[id(run)], models.get(run.root, of_all).car_is_there), outcomes(judged[id(run)]))
-        for run in runs
+        (probabilities(cars, row.model.car_is_there), outcomes(cars)) for row in rows.values() for cars in row.cars
     ]
     predicted, true = (np.concatenate(x) for x in zip(*pairs, strict=True))
-    rows = ["| predicted | better: predicted, true (cars) | not worse: predicted, true (cars) |", "|---|---|---|"]
+    lines = ["| predicted | better: predicted, true (cars) | not worse: predicted, true (cars) |", "|---|---|---|"]
     for low, high in pairwise(BINS):
         cells = []
         for column in range(2):
@@ -157,19 +192,18 @@ def _reliability(
                 f"{predicted[within, column].mean():.2f}, {true[within, column].mean():.2f}" if within.any() else ""
             )
             cells.append(f"{figures} ({within.sum()})")
-        rows.append(f"| {low:g} to {high:g} | " + " | ".join(cells) + " |")
-    return "\n".join(rows)
+        lines.append(f"| {low:g} to {high:g} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
 
 
-def _coverage(runs: Sequence[Cars], judged: Mapping[int, Judged]) -> str:
+def _coverage(rows: Rows) -> str:
     """True errors over the standard deviations that are given, by their medians: 1 is right."""
-    rows = ["| true over given sigma | " + " | ".join(CAR_QUANTITIES[:4]) + " |", "|---|---|---|---|---|"]
-    for root in dict.fromkeys(run.root for run in runs):
-        for detector in dict.fromkeys(run.detector for run in runs if run.root == root):
-            some = [judged[id(run)].standard for run in runs if (run.root, run.detector) == (root, detector)]
-            ratio = np.median(np.abs(np.concatenate(some)[:, :4]), axis=0) * _TO_SIGMA
-            rows.append(f"| {root} {detector} | " + " | ".join(f"{x:.2f}" for x in ratio) + " |")
-    return "\n".join(rows)
+    lines = ["| true over given sigma | " + " | ".join(CAR_QUANTITIES[:4]) + " |", "|---|---|---|---|---|"]
+    for (root, detector), row in rows.items():
+        standard = np.concatenate([cars.standard for cars in row.cars])
+        ratio = np.median(np.abs(standard[:, :4]), axis=0) * _TO_SIGMA
+        lines.append(f"| {root} {detector} | " + " | ".join(f"{x:.2f}" for x in ratio) + " |")
+    return "\n".join(lines)
 
 
 def _noises(models: Mapping[str, TrustModel]) -> str:

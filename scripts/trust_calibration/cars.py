@@ -19,7 +19,7 @@ from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.io.config_files import load_config
 from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
-from directshape_torch.refinement.fusion import chances, compared, fused, noise_of_boxes
+from directshape_torch.refinement.fusion import DetectorComparison, chances, compared, fused, noise_of_boxes
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.trust import WORSE_BY, ImageNoise, LogisticHead
 from directshape_torch.refiner import DirectShapeRefiner
@@ -27,7 +27,7 @@ from directshape_torch.rig.detector_noise import detector_sigmas, rows_of
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.from_files import estimate_rigs
 from directshape_torch.rig.rigs import RigEstimates
-from directshape_torch.scene import Detections
+from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.state.cars import CarBatch
 
 Array = NDArray[np.float64]
@@ -43,14 +43,16 @@ class Frame(NamedTuple):
     detections: Detections
     cars: CarBatch  # of them
     boxes: tuple[Tensor, Tensor] | None  # (N, 7) of detections and labels in the frame of labels; None: no cars there
+    before: Array  # (N,) overlap of the input with the label; NaN without a label
+    images: Array  # (N,) overlap of the images' box with the label
 
 
 class Judged(NamedTuple):
     """N cars of a run as some image noise and some detector's standard deviations have them."""
 
     before: Array  # (N,) overlap of the input with the label; NaN without a label
-    images: Array  # (N,) that of the images' box
-    after: Array  # (N,) that of the most probable box
+    images: Array  # (N,) overlap of the images' box with the label
+    after: Array  # (N,) overlap of the most probable box with the label
     evidence: Array  # (N, E)
     chance: Array  # (N, 2) of a better and of a not worse box, where the car is there
     standard: Array  # (N, 7) errors of the most probable box over their standard deviations
@@ -66,31 +68,46 @@ class Cars:
     elsewhere: list[Frame]
     by_frame: bool  # rig and detector are what each frame tells by itself
 
-    def judged(self, noise: ImageNoise, elsewhere: bool = False) -> Judged:
-        """The cars as this image noise has them, with the detector's that the run learns by it."""
+    def compared(self, noise: ImageNoise, elsewhere: bool = False) -> list[tuple[Frame, CarBatch, DetectorComparison]]:
+        """Each frame as this image noise has it, with the detector's noise that the run learns by it."""
         rows = [rows_of(compared(frame.result, frame.cars, noise)) for frame in self.frames]
-        of_run = detector_sigmas(torch.cat(rows))
-        if elsewhere or not self.by_frame:
-            parts = [_judged(frame, noise, of_run) for frame in (self.elsewhere if elsewhere else self.frames)]
-        else:
-            pairs = zip(self.frames, rows, strict=True)
-            parts = [_judged(frame, noise, detector_sigmas(own)) for frame, own in pairs]
+        of_run = [detector_sigmas(torch.cat(rows))]
+        frames = self.elsewhere if elsewhere else self.frames
+        sigmas = [detector_sigmas(own) for own in rows] if self.by_frame else of_run * len(frames)
+        found = []
+        for frame, known in zip(frames, sigmas, strict=True):
+            cars = replace(frame.cars, detector_noise=noise_of_boxes(known, frame.detections.T_cam_obj))
+            found.append((frame, cars, compared(frame.result, cars, noise)))
+        return found
+
+    def evidence(self, noise: ImageNoise, elsewhere: bool = False) -> Array:
+        """Whether each car is there (N, E), as this image noise has it."""
+        return np.concatenate([_evidence(frame, at) for frame, _, at in self.compared(noise, elsewhere)])
+
+    def judged(self, noise: ImageNoise, elsewhere: bool = False) -> Judged:
+        """All cars as this image noise has them."""
+        parts = [_judged(*each, noise) for each in self.compared(noise, elsewhere)]
         return Judged(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
+    def overlaps(self) -> tuple[Array, Array]:
+        """Overlaps (N,) of inputs and of the images' boxes with the labels."""
+        return np.concatenate([frame.before for frame in self.frames]), np.concatenate([f.images for f in self.frames])
 
-def _judged(frame: Frame, noise: ImageNoise, sigmas: Tensor) -> Judged:
-    result, cars = frame.result, replace(frame.cars, detector_noise=noise_of_boxes(sigmas, frame.detections.T_cam_obj))
-    comparison = compared(result, cars, noise)
-    chance = torch.stack(chances(result, comparison, brings_together=True), dim=1).numpy()
-    evidence = result.quality.evidence.clone()
+
+def _evidence(frame: Frame, comparison: DetectorComparison) -> Array:
+    evidence = frame.result.quality.evidence.clone()
     evidence[:, 2] = (comparison.distance_in_sigmas**2 + 3).log()
+    return evidence.numpy()
+
+
+def _judged(frame: Frame, cars: CarBatch, comparison: DetectorComparison, noise: ImageNoise) -> Judged:
+    result = frame.result
+    chance = torch.stack(chances(result, comparison, brings_together=True), dim=1).numpy()
     together = fused(replace(result, comparison=comparison), frame.detections)
-    before = images = after = np.full(len(result), np.nan)
-    standard = np.full((len(result), 7), np.nan)
+    after, standard = np.full(len(result), np.nan), np.full((len(result), 7), np.nan)
     if frame.boxes is not None:
-        detector, truth = frame.boxes
-        own, both = (each.to_boxes("kitti", "ref").double() for each in (result, together))
-        before, images, after = (pose_errors(boxes, truth).bev_iou.numpy() for boxes in (detector, own, both))
+        _, truth = frame.boxes
+        after = pose_errors(together.to_boxes("kitti", "ref").double(), truth).bev_iou.numpy()
         of_truth = replace(
             cars,
             detector_T_cam_obj=_poses(truth, result.t_cam_ref).to(result.T_cam_obj),
@@ -98,7 +115,7 @@ def _judged(frame: Frame, noise: ImageNoise, sigmas: Tensor) -> Judged:
         )
         error = compared(together, of_truth, noise).difference
         standard = (error / comparison.covariance.diagonal(dim1=1, dim2=2).sqrt()).numpy()
-    return Judged(before, images, after, evidence.numpy(), chance, standard)
+    return Judged(frame.before, frame.images, after, _evidence(frame, comparison), chance, standard)
 
 
 def _poses(boxes: Tensor, t_cam_ref: Tensor) -> Tensor:
@@ -154,7 +171,7 @@ def _with_labels(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> list[Frame
     found = match_to_labels(loaded.detected_objects, loaded.labels or [])
     rows = [row for row, label in found.items() if result.refined[row] and is_counted(label)]
     boxes = boxes_of([loaded.detected_objects[row] for row in rows]), boxes_of([found[row] for row in rows])
-    return [_frame(loaded, result, loaded.detections, rows, boxes)] if rows else []
+    return [_frame(_corrected(refiner, loaded), result, loaded.detections, rows, boxes)] if rows else []
 
 
 def _elsewhere(refiner: DirectShapeRefiner, loaded: Sequence[LoadedFrame]) -> list[Frame]:
@@ -172,20 +189,31 @@ def _elsewhere(refiner: DirectShapeRefiner, loaded: Sequence[LoadedFrame]) -> li
         is_free = (box_iou(boxes, taken) < _MOST_OVERLAP).all(axis=1)
         rows = [row for row in range(len(result)) if is_free[row] and result.refined[row]]
         if rows:
-            frames.append(_frame(other, result, each.detections, rows, None))
+            frames.append(_frame(_corrected(refiner, other), result, each.detections, rows, None))
     return frames
 
 
+def _corrected(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> FrameBatch:
+    """The frame with what is known of its rig, as the refiner sees it."""
+    assert refiner.rig is not None
+    return refiner.rig.corrected(loaded.frame)
+
+
 def _frame(
-    loaded: LoadedFrame,
+    frame: FrameBatch,
     result: RefinementResult,
     detections: Detections,
     rows: list[int],
     boxes: tuple[Tensor, Tensor] | None,
 ) -> Frame:
     index = torch.tensor(rows, dtype=torch.long)
-    chosen = detections.rows(index)
-    return Frame(result.rows(index), chosen, CarBatch.from_scene(loaded.frame, chosen), boxes)
+    chosen, some = detections.rows(index), result.rows(index)
+    before = images = np.full(len(rows), np.nan)
+    if boxes is not None:
+        before, images = (
+            pose_errors(each, boxes[1]).bev_iou.numpy() for each in (boxes[0], some.to_boxes("kitti", "ref").double())
+        )
+    return Frame(some, chosen, CarBatch.from_scene(frame, chosen), boxes, before, images)
 
 
 def probabilities(judged: Judged, is_there: LogisticHead) -> Array:

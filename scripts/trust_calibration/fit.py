@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.refinement.trust import ImageNoise, LogisticHead
-from trust_calibration.cars import Array, Cars, Judged, errors_of_images
+from directshape_torch.refinement.trust import EVIDENCE_NAMES, WORSE_BY, ImageNoise, LogisticHead
+from trust_calibration.cars import Array, Cars, errors_of_images
 
 FACTORS, FLOORS = np.r_[0.0, np.geomspace(0.1, 4, 25)], np.geomspace(0.005, 0.5, 40)
 _RIDGE = 3.0
@@ -23,11 +23,10 @@ def fit_noise(runs: Sequence[Cars]) -> ImageNoise:
     rows, weights = [], []
     for root in {run.root for run in runs}:
         frames = [frame for run in runs if run.root == root for frame in run.frames]
-        errors, sigmas = (np.concatenate(x) for x in zip(*map(errors_of_images, frames), strict=True))
-        rows.append(np.stack([errors, sigmas]))
-        weights.append(np.full(len(errors), 1 / len(errors)))
-    (errors, sigmas), weight = np.concatenate(rows, axis=1), np.concatenate(weights)
-    pairs = [most_likely(errors[:, k], sigmas[:, k], weight) for k in range(7)]
+        rows.append(np.stack([np.concatenate(x) for x in zip(*map(errors_of_images, frames), strict=True)]))
+        weights.append(np.full(rows[-1].shape[1], 1 / rows[-1].shape[1]))
+    each, weight = np.concatenate(rows, axis=1), np.concatenate(weights)
+    pairs = [most_likely(*each[:, :, k], weight) for k in range(7)]
     return ImageNoise(*zip(*pairs, strict=True))
 
 
@@ -40,10 +39,18 @@ def most_likely(error: Array, sigma: Array, weight: Array) -> tuple[float, float
     return float(factor[best, 0]), float(floor[best, 0])
 
 
-def fit_head(cars: Sequence[Judged], elsewhere: Sequence[Judged]) -> LogisticHead:
-    """The regression of cars that are there against boxes on other images."""
-    there = np.concatenate([c.evidence[c.images > np.minimum(_LEAST_IOU, c.before - 0.05)] for c in cars])
-    not_there = np.concatenate([c.evidence for c in elsewhere])
+def evidence_of(runs: Sequence[Cars], noise: ImageNoise) -> tuple[Array, Array]:
+    """The evidence (N, E) of cars that are there, and that of boxes on other images."""
+    there, not_there = [], [np.empty((0, len(EVIDENCE_NAMES)))]
+    for run in runs:
+        before, images = run.overlaps()
+        there.append(run.evidence(noise)[images > np.minimum(_LEAST_IOU, before - WORSE_BY)])
+        not_there += [run.evidence(noise, elsewhere=True)] if run.elsewhere else []
+    return np.concatenate(there), np.concatenate(not_there)
+
+
+def fit_head(there: Array, not_there: Array) -> LogisticHead:
+    """The regression of cars that are there against boxes on other images, by their evidence (N, E)."""
     X, y = np.concatenate([there, not_there]), np.r_[np.ones(len(there)), np.zeros(len(not_there))]
     means, scales = np.nanmean(X, axis=0), np.nanstd(X, axis=0)
     weights, bias = logistic(np.nan_to_num(np.clip((X - means) / scales, -3, 3)), y)
