@@ -343,7 +343,7 @@ class AcceptanceConfig(Settings):
         at_most=1,
     )
     min_probability_not_worse: float = setting(
-        0.8,
+        0.85,
         "least probability that it fell by at most 0.05; 0 for both: no result is refused for its probabilities",
         at_least=0,
         at_most=1,
