@@ -277,13 +277,12 @@ class DirectShapeRefiner(nn.Module):
             from directshape_torch.refinement.box_alignment import align_boxes
 
             return align_boxes(problem, initial, cars, came)
-        alone = Refined.of(problem, cars, initial, initial, came)
         if cars.track_id is None:
-            return alone.result(initial)
+            return Refined.of(problem, cars, initial, initial, came).result(initial)
         # Here, for cars by themselves need nothing of it.
         from directshape_torch.tracks.share import brought_together
 
-        return brought_together(alone, initial, came)
+        return brought_together(problem, cars, initial, came)
 
 
 def _config_cure(config: object) -> str:

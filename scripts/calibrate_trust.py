@@ -6,8 +6,8 @@
 DETECTIONS are a folder of result files, or `stereo` or `mono`: a detector that is simulated from labels, ten times.
 A run learns what its detector is off by from its own results, never from labels. Labels tell what the images are off by
 and, beside boxes and masks that are laid on other images, when a car is there; each draw counts as much as another.
-Each run is judged by what other roots with other detectors have told; cars that the package refuses for want of
-evidence take no part.
+Each run is judged by what other roots (by the names of their folders) with other detectors have told, where all runs
+have such; cars that the package refuses for want of evidence take no part.
 Written to OUT: the draws, `report.md`, and `trust_model.json`, fitted to all.
 """
 
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     runs = [run for run in runs_of(args) if run.frames]
     rows = list(dict.fromkeys((run.root, run.detector) for run in runs))
-    others = {row: [run for run in runs if run.root != row[0] and run.detector != row[1]] for row in rows}
+    others = {row: others_of(runs, row) for row in rows}
     left_out = not args.by_frame and all(others.values())
     of_all = bundled_trust_model() if args.by_frame else fitted(runs)
     models = {row: fitted(others[row]) if left_out else of_all for row in rows}
@@ -109,6 +109,11 @@ def run(args: argparse.Namespace) -> None:
     ]
     write_text(args.out / "report.md", "\n\n".join(parts) + "\n")
     print("\n\n".join(parts))
+
+
+def others_of(runs: Sequence[Cars], row: tuple[str, str]) -> list[Cars]:
+    """The runs of other roots with other detectors than those of a row."""
+    return [run for run in runs if run.root != row[0] and run.detector != row[1]]
 
 
 class JudgedRow(NamedTuple):
@@ -156,7 +161,7 @@ def _policies(rows: Rows, limits: AcceptanceConfig) -> str:
 
 def _thresholds(rows: Rows, limits: AcceptanceConfig) -> str:
     """What other limits of the probability of a box that is not worse would return."""
-    head = "returned from", *(f"{least:g}" for least in THRESHOLDS)
+    head = f"better from {limits.min_probability_better:g}, not worse from", *(f"{least:g}" for least in THRESHOLDS)
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for (root, detector), row in rows.items():
         cells = []

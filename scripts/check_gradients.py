@@ -1,11 +1,11 @@
 """The Jacobian laboratory: every derivative of the energy three ways, in named regimes, with real image content.
 
-Every term (silhouettes and photometric in both forms, points, all priors) has its hand-derived Jacobian compared with
-autograd and with central differences (Richardson extrapolation over a sweep of steps), and its gradient the derivative
-by autograd with differences. Entries that differences cannot judge, as their own estimate of error says, are excluded
-and counted. A term of one's own, `--term module:factory`, is examined as the built-in ones are, and its shapes are
-checked. Exit code 1 when a bound is broken: analytic against autograd 1e-9, against numeric 1e-6, relative to the norm
-of the row, float64; less than 2 percent excluded in the typical regime.
+Every term (silhouettes and tilt in both forms, photometric, points, all priors) has its hand-derived Jacobian compared
+with autograd and with central differences (Richardson extrapolation over a sweep of steps), and its gradient the
+derivative by autograd with differences. Entries that differences cannot judge, as their own estimate of error says, are
+excluded and counted. A term of one's own, `--term module:factory`, is examined as the built-in ones are, and its shapes
+are checked. Exit code 1 when a bound is broken: analytic against autograd 1e-9, against numeric 1e-6, relative to the
+norm of the row, float64; less than 2 percent excluded in the typical regime.
 
     python scripts/check_gradients.py --out gradients
     python scripts/check_gradients.py --term photometric silhouettes --regime typical near_3m --states 12

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from directshape_torch.config import StageConfig
 from directshape_torch.errors import InputError, NoGradientWarning
-from directshape_torch.refinement import tracks as tracks_module
+from directshape_torch.refinement import refined as refinements
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
@@ -171,8 +171,8 @@ def test_products_have_all_digits_whatever_the_network_around_is_allowed(monkeyp
         asked.append(torch.get_float32_matmul_precision())
         return minimise(*args, **kwargs)
 
-    minimise = tracks_module.minimise
-    monkeypatch.setattr(tracks_module, "minimise", watched)
+    minimise = refinements.minimise
+    monkeypatch.setattr(refinements, "minimise", watched)
     _, scene = cached_street()
     refiner = DirectShapeRefiner(ellipsoid_prior(torch.float64), DEFAULT)
     torch.set_float32_matmul_precision("high")

@@ -23,7 +23,7 @@ from directshape_torch.rows import Blocks
 from directshape_torch.scene import Detections
 from directshape_torch.shape.field import Field
 from directshape_torch.state.cars import CarBatch, CarState
-from directshape_torch.state.unknowns import POSE
+from directshape_torch.state.unknowns import CODE, OFFSET, POSE
 from directshape_torch.status import Status
 from directshape_torch.terms.car_points import car_points
 from directshape_torch.terms.point_cloud import PointCloud
@@ -85,13 +85,18 @@ def test_points_of_a_lidar_beside_the_images_are_the_combined_method() -> None:
     torch.testing.assert_close(extra.T_cam_obj, combined(scene.frames, detections).T_cam_obj, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("derived", [False, True])
 @pytest.mark.parametrize("mode", ["implicit", "unroll"])
-def test_a_term_of_ones_own_carries_gradients(mode: str) -> None:
+def test_a_term_of_ones_own_carries_gradients(mode: str, derived: bool) -> None:
     inputs = StreetInputs()
+
+    def residual_of(metres: Tensor | float) -> Any:
+        by_hand = lower_by(metres)
+        return (lambda cars, state: by_hand(cars, state).residual) if derived else by_hand
 
     def heights(metres: Tensor | float, config: RefinerConfig) -> Tensor:
         detections = replace(inputs.detections, mask_left=inputs.mask)
-        refiner = DirectShapeRefiner(inputs.prior, config, [made(residual_of=lower_by(metres), weight=100.0)])
+        refiner = DirectShapeRefiner(inputs.prior, config, [made(residual_of=residual_of(metres), weight=100.0)])
         result: RefinementResult = refiner(inputs.scene.frames, detections)
         return result.T_cam_obj[:, 1, 3].sum()
 
@@ -307,6 +312,55 @@ class TwoToARow(ResidualTerm):
 def test_two_residuals_of_a_row_need_a_jacobian_by_hand() -> None:
     with pytest.raises(InputError, match=r"'user': residual\(...\): expected one residual a row.*write linear"):
         refine(lambda *scene: TwoToARow.of("user", scene[2]))
+
+
+def of_offset(_: CarBatch, state: CarState) -> Tensor:
+    """Pulls an unknown offset of the disparity to a pixel; nothing where the rig is known."""
+    return state.offset_px - 1.0
+
+
+@pytest.mark.parametrize("sees", [(POSE, CODE), (OFFSET,)])
+def test_a_residual_without_a_jacobian_is_differentiated_by_every_unknown(sees: tuple[str, ...]) -> None:
+    """Whatever it says that it sees: an offset that nobody pulled would end elsewhere."""
+    _, scene = cached_street()
+    detections = replace(disturbed(scene.detections), offset_sigma_px=torch.full((2,), 0.3, dtype=torch.float64))
+
+    def factory(*given: Any) -> PriorTerm:
+        return PriorTerm("user", 1e4, given[2], of_offset, 1, sees)
+
+    pulled, free = (refine(*extra, detections=detections) for extra in ([factory], []))
+    nearer = free.T_cam_obj[:, 2, 3] - pulled.T_cam_obj[:, 2, 3]
+    assert (nearer.abs() > 0.2).all()
+
+
+def test_a_term_that_sees_the_offset_alone_says_nothing_where_the_rig_is_known() -> None:
+    def nothing(_: CarBatch, state: CarState) -> PriorResidual:
+        rows = len(state.code), state.offset_px.shape[1]
+        return PriorResidual(state.code.new_zeros(len(state.code), 1), state.code.new_zeros(rows[0], 1, rows[1]))
+
+    found = refine(lambda *scene: PriorTerm("user", 1.0, scene[2], nothing, 1, (OFFSET,)))
+    torch.testing.assert_close(found.T_cam_obj, refine().T_cam_obj, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("sees", [("poses",), "pose", ("pose", "pose"), ("path",)])
+def test_blocks_that_no_car_has_are_named(sees: Any) -> None:
+    with pytest.raises(InputError, match=r"'user': sees: expected names of blocks of unknowns.*'offset'"):
+        refine(lambda *scene: PriorTerm("user", 1.0, scene[2], lower_by(0.1), 1, sees))
+
+
+def test_a_residual_that_is_none_is_named() -> None:
+    with pytest.raises(InputError, match=r"'user': its residual: expected a Tensor or a PriorResidual, got None"):
+        refine(made(residual_of=lambda *_: None))
+
+
+def test_what_begins_a_term_with_a_jacobian_needs_none_itself() -> None:
+    class Begins(ResidualTerm):
+        def begin(self, stage: Any, sight: Sight) -> Any:
+            return LowerTerm.of(self.names[0], self.cars)
+
+    found = refine(lambda *scene: Begins.of("user", scene[2]))
+    expected = refine(lambda *scene: LowerTerm.of("user", scene[2]))
+    torch.testing.assert_close(found.T_cam_obj, expected.T_cam_obj, rtol=0, atol=0)
 
 
 class TensorTerm(LowerTerm):

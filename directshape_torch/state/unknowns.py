@@ -44,6 +44,8 @@ class Block(NamedTuple):
         if not self.is_pose:
             moved = value + step
             return moved.clamp(-max_code, max_code) if self.is_bounded else moved
+        # A bound of the angle holds for steps within the trust region, which some poses have none of.
+        max_angle = max_angle if math.isfinite(self.largest_step[0]) else math.inf
         flat = value.flatten(0, -3)
         return torch.bmm(se3.exp(step.reshape(-1, 6), max_angle), flat).view_as(value)
 
@@ -111,11 +113,11 @@ class Unknowns:
 
     def span(self, *names: str) -> slice:
         """The columns of blocks that stand beside each other."""
-        number = [block.name for block in self.blocks].index(names[0])
-        named = self.blocks[number : number + len(names)]
-        assert tuple(block.name for block in named) == names, f"{names} do not stand beside each other"
-        first = sum(block.size for block in self.blocks[:number])
-        return slice(first, first + sum(block.size for block in named))
+        first, last = (self._names().index(name) for name in (names[0], names[-1]))
+        between = [block for block in self.blocks[first : last + 1] if block.size or block.name in names]
+        assert tuple(block.name for block in between) == names, f"{names} do not stand beside each other"
+        start = sum(block.size for block in self.blocks[:first])
+        return slice(start, start + sum(block.size for block in between))
 
     def only(self, *names: str) -> Unknowns:
         """The unknowns of some blocks, in the order of the state."""
@@ -129,6 +131,8 @@ class Unknowns:
     def placed(self, J: Tensor, sees: Sequence[str]) -> Tensor:
         """A Jacobian (..., D) by all unknowns from that by the blocks which a residual `sees`, in their order.
 
+        A Jacobian that has all D columns stays as it is.
+
         Examples:
             >>> Unknowns(blocks_of_car(num_codes=2, num_offsets=1)).placed(torch.ones(1, 2), ["code"])
             tensor([[0., 0., 0., 0., 0., 0., 1., 1., 0.]])
@@ -136,8 +140,10 @@ class Unknowns:
         sizes = {block.name: block.size for block in self.blocks}
         seen = [name for name in sees if sizes.get(name)]
         names = [block.name for block in self.blocks if block.size]
-        if seen == names:
+        if J.shape[-1] == self.size:
             return J
+        if not seen:
+            return J.new_zeros(*J.shape[:-1], self.size)
         first = names.index(seen[0])
         if names[first : first + len(seen)] == seen:
             span = self.span(*(block.name for block in self.blocks if block.name in seen))
@@ -184,6 +190,9 @@ class Unknowns:
             if block.is_bounded:
                 free[:, first:last] = value.abs() < max_code
         return free
+
+    def _names(self) -> list[str]:
+        return [block.name for block in self.blocks]
 
     def _borders(self) -> list[int]:
         return list(accumulate((block.size for block in self.blocks), initial=0))

@@ -16,13 +16,14 @@ from directshape_torch.numerics.gradient_mode import map_tensors
 from directshape_torch.rows import Blocks
 from directshape_torch.shape.field import Field
 from directshape_torch.solver.problem import take_rows
-from directshape_torch.state.unknowns import State
+from directshape_torch.state.unknowns import CODE, OFFSET, POSE, State
 from directshape_torch.terms.term import Linear, Sight, Term, Where, linear_of, part_of
 
 _OWN = ("names", "blocks", "block_weight", "information", "row_weight", "residual", "norm", "of_cars")
 _DEFAULTS = ("sees", "is_prior", "column", "begin", "moving", "where", "linear")
 # Of the largest entry of the matrices and gradients: above what rounding does, below what a centimetre does.
 _ROUNDING = 1e-4
+_BLOCKS = POSE, CODE, OFFSET
 _LEAVING = "hand tensors of the cars to PriorTerm(values=...), or cut them in of_cars(keep, numbers)"
 
 
@@ -34,6 +35,10 @@ def check_members(term: Term) -> None:
     names = term.names
     if not (isinstance(names, tuple) and names and all(isinstance(name, str) for name in names)):
         raise InputError(f"extra term {type(term).__name__}: names", "a tuple of at least one str", repr(names))
+    sees = term.sees
+    if not (isinstance(sees, tuple) and set(sees) <= set(_BLOCKS) and len(set(sees)) == len(sees)):
+        cure = f"a tuple of some of {', '.join(map(repr, _BLOCKS))}"
+        raise InputError(f"extra term {names[0]!r}: sees", "names of blocks of unknowns", repr(sees), cure)
 
 
 @torch.no_grad()
@@ -169,8 +174,9 @@ def _check_linear(called: str, term: Term, where: Where, field: Field, state: St
     of_rows = tuple(term.row_weight.shape)
     check_shape(f"{called}.residual", at.residual, of_rows, f"one for each block, row and residual; {_LEAVING}")
     check_shape(f"{called}.J_residual_inner", at.J_residual_inner, of_rows, "by the row's inner scalar")
-    by_seen = (*of_rows[:2], state.unknowns.only(*term.sees).size)
-    seen = ", ".join(term.sees)
+    num_columns, seen = at.J_inner_state.shape[-1:], ", ".join(term.sees)
+    size = state.unknowns.size if num_columns == (state.unknowns.size,) else state.unknowns.only(*term.sees).size
+    by_seen = (*of_rows[:2], size)
     check_shape(f"{called}.J_inner_state", at.J_inner_state, by_seen, f"by {seen}, without the residual's axis")
     with named_errors(called.replace("linear", "residual"), len(state.code)):
         again = term.residual(field, state, at.where)

@@ -63,8 +63,8 @@ class Derived(Term):
     def row_weight(self) -> Tensor:
         return self.term.row_weight
 
-    def begin(self, stage: StageConfig, sight: Sight) -> Derived:
-        return replace(self, term=self.term.begin(stage, sight))
+    def begin(self, stage: StageConfig, sight: Sight) -> Term:
+        return with_jacobian(self.term.begin(stage, sight), self.prior)
 
     def moving(self, sight: Sight, after_wider: bool) -> tuple[Derived, Where, Tensor]:
         term, where, resting = self.term.moving(sight, after_wider)
@@ -79,8 +79,7 @@ class Derived(Term):
             cure = "write linear(...) by hand, which may give several residuals of a row one inner scalar"
             called = f"extra term {self.names[0]!r}: residual(...)"
             raise InputError(called, "one residual a row, shape (M, R, 1)", f"{tuple(residual.shape)}", cure)
-        columns = state.unknowns.columns(self.sees, J.device)
-        return Linear(residual, torch.ones_like(residual), J[:, :, 0, columns], where)
+        return Linear(residual, torch.ones_like(residual), J[:, :, 0], where)
 
     def residual(self, field: Field, state: State, where: Where) -> Tensor:
         return self.term.residual(field, state, where)

@@ -75,7 +75,11 @@ class PriorTerm(Term):
     def _at(self, state: State) -> PriorResidual | Tensor:
         """What `residual_of` says of a state, from the rows of the cars that are left."""
         rows = self.cars.detection_row
-        return self.residual_of(self.cars, state, **{name: x.index_select(0, rows) for name, x in self.values.items()})
+        at = self.residual_of(self.cars, state, **{name: x.index_select(0, rows) for name, x in self.values.items()})
+        if not isinstance(at, (Tensor, PriorResidual)):
+            cure = "return the residual as a tensor (B, R), or PriorResidual(residual, J)"
+            raise InputError(f"extra term {self.name!r}: its residual", "a Tensor or a PriorResidual", shown(at), cure)
+        return at
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -98,7 +102,7 @@ class PriorTerm(Term):
         return torch.ones_like(self.cars.input_depth, dtype=torch.float64).expand(self.num_rows, 1, -1).movedim(-1, 0)
 
     def _derived(self, state: State) -> PriorResidual:
-        """The residual with its Jacobian by forward-mode differentiation."""
+        """The residual with its Jacobian by all unknowns, from forward-mode differentiation."""
         unknowns = state.unknowns
 
         def residual(delta: Tensor) -> tuple[Tensor, Tensor]:
@@ -108,7 +112,7 @@ class PriorTerm(Term):
 
         zero = torch.zeros(unknowns.size, dtype=state.code.dtype, device=state.code.device)
         J, value = torch.func.jacfwd(residual, has_aux=True)(zero)
-        return PriorResidual(value, J[..., unknowns.columns(self.sees, J.device)])
+        return PriorResidual(value, J)
 
     def linear(self, field: Field, state: State, where: Where) -> Linear:
         at = self._at(state)

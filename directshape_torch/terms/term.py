@@ -41,7 +41,8 @@ class Linear(NamedTuple):
 
     residual: Tensor  # (M, R, N)
     J_residual_inner: Tensor  # (M, R, N)
-    J_inner_state: Tensor  # (M, R, S) by the unknowns that the term sees, block after block
+    # (M, R, S) by the unknowns that the term sees, block after block, or (M, R, D) by all
+    J_inner_state: Tensor
     where: Where  # the points at which they were taken
 
 
@@ -124,7 +125,7 @@ class Term(Protocol):
         """Of single residuals (M, R, N); zero in empty places."""
         ...
 
-    def begin(self, stage: StageConfig, sight: Sight) -> Self:
+    def begin(self, stage: StageConfig, sight: Sight) -> Term:
         """The term of a stage, which for rows that are the same in all stages is the term itself."""
         return self
 

@@ -24,8 +24,8 @@ from directshape_torch.state.unknowns import CODE
 from directshape_torch.status import Status, is_refined
 from directshape_torch.terms.photometric import PhotometricEvidence
 from directshape_torch.terms.term import Evidence
-from directshape_torch.tracks.next_view import NextView, NextViewEvidence, NextViews
-from directshape_torch.tracks.path import hold_of_path, motion_terms, timed, with_path
+from directshape_torch.tracks.next_view import NEXT_VIEW_NAME, NextView, NextViewEvidence, NextViews
+from directshape_torch.tracks.path import MOTION_NAMES, hold_of_path, motion_terms, timed, with_path
 from directshape_torch.tracks.same_car import Parts, SaidOfShape, cut_once, is_cut_off, parts_by_shape, unlikeness
 from directshape_torch.tracks.state import NEXT_POSE, PATH, TrackState, own_and_shared
 
@@ -36,14 +36,21 @@ _MORE_ITERATIONS = 2
 _IN_COMMON = 0.5
 
 
-def brought_together(alone: Refined[CarState], initial: CarState, came: RefinementResult) -> RefinementResult:
+def brought_together(
+    problem: CarProblem, cars: CarBatch, initial: CarState, came: RefinementResult
+) -> RefinementResult:
     """The result of B cars, some of which are views of tracks, with the graph of the backward mode.
 
     Args:
-        alone: the cars, each refined by itself.
+        problem: of these cars, each by itself.
+        cars: the cars, with their tracks.
         initial: input states.
         came: what is known of the cars beforehand.
     """
+    for name in (name for name in (*MOTION_NAMES, NEXT_VIEW_NAME) if name in problem.term_names):
+        cure = "give the term another name"
+        raise InputError(f"extra term {name!r}: names", "names that no column of a track has", repr(name), cure)
+    alone = Refined.of(problem, cars, initial, initial, came)
     says = SaidOfShape.at(alone.minimum)
     doubtful = alone.minimum.status == Status.not_trusted.code
     joins = (is_refined(alone.minimum.status) | doubtful) & says.anything
@@ -214,8 +221,6 @@ def in_tracks(
     if stereo is not None and _looks_at_next(problem):
         added.append(NextViewEvidence(config.tracks.next_view_weight, stereo, NextViews.of(views, next_view)))
         columns.append(one)
-    for name in (name for each in added for name in each.names if name in problem.term_names):
-        raise InputError(f"extra term {name!r}: names", "names that no column of a track has", repr(name))
     before = sum(len(each.names) for each in problem.evidence)
     unknowns, device = _linked(problem, sharing, views, alone, next_view).unknowns, alone.code.device
     shared = torch.cat([sharing.shared, unknowns.columns((PATH,), device)])

@@ -18,7 +18,7 @@ from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.solver.gauss_newton import Minimum, minimise
-from directshape_torch.solver.problem import put_rows, where_rows
+from directshape_torch.solver.problem import put_rows, take_rows, where_rows
 from directshape_torch.state.cars import CarState
 from directshape_torch.status import Status
 from directshape_torch.visualize.residuals import CarResiduals, car_residuals
@@ -70,7 +70,7 @@ class RefinementTrace:
     @torch.no_grad()
     def residuals(self, number: int) -> dict[int, CarResiduals]:
         """What the images say of state `number` of each car that took part, by its row among the detections."""
-        sight = self.last_stage.problem.look(CarState(*(x[self.rows] for x in self.states[number])))
+        sight = self.last_stage.problem.look(take_rows(self.states[number], self.rows))
         return dict(zip(self.rows.tolist(), car_residuals(self.last_stage, self.pixels, sight), strict=True))
 
     def place_of(self, car: int) -> int:
@@ -99,7 +99,7 @@ def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections
     took_part = result.cost_before.isfinite().all(dim=1)
     rows = took_part.nonzero()[:, 0]
     everyone, inputs = refiner.problem(frames, detections)
-    problem, initial = everyone.of_problems(took_part), CarState(*(x[rows] for x in inputs))
+    problem, initial = everyone.of_problems(took_part), take_rows(inputs, rows)
     with full_precision(), compiling(refiner.config.compile):
         minimum: Minimum[CarState] = minimise(problem, initial, refiner.config.solver, record=True)
         states = [initial, *_ends(minimum)]

@@ -21,7 +21,7 @@ from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rows import PixelSamples, Rows
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.state.cars import CarState
+from directshape_torch.solver.problem import take_rows
 from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.term import Part, Sight
 from directshape_torch.visualize.drawing import Array, View, blue_white_red
@@ -121,7 +121,7 @@ def residual_maps(
     chosen, found = torch.zeros(len(detections), dtype=torch.bool).index_fill(0, rows, True), []
     with full_precision():
         of_all, inputs = DirectShapeRefiner(prior, config).problem(frame, detections)
-        problem, start = of_all.of_problems(chosen), CarState(*(x[rows] for x in inputs))
+        problem, start = of_all.of_problems(chosen), take_rows(inputs, rows)
         pixels = pack_pixels(frame, detections, sampling).of_objects(chosen)
         for state in states:
             T_cam_obj, code = (torch.from_numpy(np.asarray(x)).to(start.code) for x in state)

@@ -28,7 +28,8 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.iteration import iterate
-from directshape_torch.terms import cars, depth, term
+from directshape_torch.state.unknowns import Unknowns
+from directshape_torch.terms import depth, term
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.priors import PriorTerm
 from directshape_torch.terms.silhouette import Silhouettes
@@ -46,7 +47,7 @@ PARTS: dict[str, tuple[Any, ...]] = {
     "photometric": (Photometric.linear,),
     "priors": (PriorTerm.linear,),
     "sums over pixels and cars": (term.part_of, term.summed),
-    "solve and step": (damped_step, cars.retract),
+    "solve and step": (damped_step, Unknowns.retract),
     "iterations, the rest": (iterate, CarIterations.choose, CarIterations.of_problems),
     "figures at the end": (CarStage.figures,),
     _OUTCOME: (outcome_of,),

@@ -8,6 +8,7 @@ from pathlib import Path
 import calibrate_trust
 import numpy as np
 import pytest
+from trust_calibration.cars import Cars
 from trust_calibration.fit import fit_head, logistic, most_likely
 
 import directshape_torch
@@ -41,6 +42,13 @@ def test_one_mask_in_twenty_is_of_no_car_whatever_the_sample_has() -> None:
         assert 1 / (1 + np.exp(-head.bias)) == pytest.approx(0.95, abs=0.01)
 
 
+def test_a_row_is_judged_by_other_roots_with_other_detectors() -> None:
+    pairs = [("a", "stereo"), ("a", "mono"), ("b", "stereo"), ("b", "mono"), ("b", "lidar")]
+    runs = [Cars(root, detector, [], [], by_frame=False) for root, detector in pairs]
+    found = [(run.root, run.detector) for run in calibrate_trust.others_of(runs, ("a", "stereo"))]
+    assert found == [("b", "mono"), ("b", "lidar")]
+
+
 def test_cars_of_the_demo_are_judged(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     masks = str(DEMO / "training" / "masks")
     cars = ["--cars", str(DEMO), "stereo", masks, "--draws", "2", "--workers", "1", "--out", str(tmp_path)]
@@ -51,6 +59,10 @@ def test_cars_of_the_demo_are_judged(capsys: pytest.CaptureFixture[str], tmp_pat
     before, alone, together = (float(row.split("|")[column].split()[0]) for column in (3, 4, 5))
     assert before < together < alone + 0.05
     assert sum(line.startswith("| 0.") for line in lines) == 6
+    limits = next(line for line in lines if line.startswith("| better from 0.5, not worse from | 0 | 0.7 |"))
+    of_row = lines[lines.index(limits) + 2].split("|")
+    assert of_row[1] == " demo stereo "
+    assert before <= float(of_row[7].split()[0]) <= float(of_row[2].split()[0]) + 0.05
     first, second = (read_objects(tmp_path / f"demo_stereo_{seed}" / "data" / "000000.txt") for seed in (0, 1))
     assert len(first) == len(second) == 6
     assert first[0].location_ref != second[0].location_ref

@@ -53,6 +53,12 @@ def test_blocks_that_a_state_has_not_take_no_columns() -> None:
     alone = CarState.of(se3.exp(random(2, 6)), random(2, 3))
     J = random(2, 4, 9)
     assert alone.unknowns.placed(J, (POSE, CODE, OFFSET)) is J
+    assert torch.equal(alone.unknowns.placed(J[..., :0], (OFFSET,)), torch.zeros(2, 4, 9, dtype=torch.float64))
+    no_offset = view()._replace(offset_px=random(2, 0)).unknowns
+    J = random(2, 4, 12)
+    expected = torch.nn.functional.pad(J, (6, 6))
+    assert torch.equal(no_offset.placed(J, (CODE, PATH)), expected)
+    assert no_offset.span(CODE, PATH) == slice(6, 18)
 
 
 def test_steps_move_every_block() -> None:

@@ -420,5 +420,6 @@ def test_a_term_of_ones_own_has_another_name_than_those_of_a_track() -> None:
         return DirectShapeRefiner(prior, DEFAULT, [user])
 
     assert named("user")(frames, detections).term_names[-1] == "user"
-    with pytest.raises(InputError, match="extra term 'next_view': names: expected names that no column of a track has"):
-        named("next_view")(frames, detections)
+    for name in ("path", "acceleration", "next_view"):
+        with pytest.raises(InputError, match=f"extra term '{name}': names: expected names that no column of a track"):
+            named(name)(frames, detections)
