@@ -58,7 +58,7 @@ def test_split_tracks_are_named(
 ) -> None:
     assert not refine(shared_kitti, sequence, tmp_path / "whole").warnings
     # Behind the first of three views.
-    monkeypatch.setattr(same_car, "_of_same_car", lambda views, *_: [x for x in (views[:-2], views[-2:]) if x])
+    monkeypatch.setattr(same_car, "_of_one_car", lambda views, *_: [x for x in (views[:-2], views[-2:]) if x])
     (warning,) = refine(shared_kitti, sequence, tmp_path / "split").warnings
     assert warning == "tracks seem to be of two cars, and were split (docs/tracks.md): 000000, 000002"
     assert read_track(track_path(tmp_path / "split", "000000")).parts.tolist() == [-1, 1, 1]
