@@ -110,7 +110,9 @@ class Bench:
             problem = problem_of_scene(c, prior, frame, detections, cars, seen, own_terms)
             if isinstance(drawn.state, TrackState):
                 problem = _of_a_track(problem, cars, drawn.state.alone)
-            stages.append(problem.begin(regime.stage, problem.look(start)))
+            # A track has the last stage alone.
+            number = min(regime.stage, len(problem.stages()) - 1)
+            stages.append(problem.begin(number, problem.look(start)))
         if own_terms:
             _check_refused(config, prior, scene, detections, cars, seen, own_terms)
         terms = _named(*stages)

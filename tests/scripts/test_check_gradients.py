@@ -59,10 +59,12 @@ def test_a_term_of_ones_own(
         "from directshape_torch.terms.priors import PriorTerm, height_prior\n\n\n"
         "def negative(cars, state):\n    at = height_prior(cars, state)\n"
         "    return at._replace(J_residual_state=-at.J_residual_state)\n\n\n"
-        "def wrong(frames, detections, cars, prior):\n    return PriorTerm('mine', 2.0, cars, negative, 1)\n\n\n"
-        "def make(frames, detections, cars, prior):\n    return PriorTerm('mine', 2.0, cars, height_prior, 1)\n\n\n"
+        "def wrong(frames, detections, cars, prior):\n"
+        "    return PriorTerm('mine', 2.0, cars, negative, 1, ('pose',))\n\n\n"
+        "def make(frames, detections, cars, prior):\n"
+        "    return PriorTerm('mine', 2.0, cars, height_prior, 1, ('pose',))\n\n\n"
         "def misshapen(frames, detections, cars, prior):\n"
-        "    return PriorTerm('mine', 2.0, cars, height_prior, 3)\n"
+        "    return PriorTerm('mine', 2.0, cars, height_prior, 3, ('pose',))\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
     assert script.main([*_QUICK, "--term", "a_term_of_my_own:make"]) == 0
@@ -84,13 +86,14 @@ def test_a_term_of_ones_own_with_values_of_each_car(
         "def lower(cars, state, metres):\n    at = height_prior(cars, state)\n"
         "    return at._replace(residual=at.residual - metres)\n\n\n"
         "def right(frames, detections, cars, prior):\n"
-        "    return PriorTerm('mine', 2.0, cars, lower, 1, values={'metres': detections.T_cam_obj[:, :1, 3]})\n\n\n"
+        "    metres = detections.T_cam_obj[:, :1, 3]\n"
+        "    return PriorTerm('mine', 2.0, cars, lower, 1, ('pose',), values={'metres': metres})\n\n\n"
         "def wrong(frames, detections, cars, prior):\n"
         "    metres = detections.T_cam_obj[:, :1, 3]\n"
         "    first = cars.detection_row - cars.detection_row.min() if len(cars) else cars.detection_row\n"
         "    table = metres[first] if len(cars) else metres\n"
         "    full = metres.new_zeros(len(metres), 1).index_copy(0, cars.detection_row, table[: len(cars)])\n"
-        "    return PriorTerm('mine', 2.0, cars, lower, 1, values={'metres': full})\n"
+        "    return PriorTerm('mine', 2.0, cars, lower, 1, ('pose',), values={'metres': full})\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
     quick = ["--regime", "typical", "--pixels", "8", "--no-second", "--states", "3"]
