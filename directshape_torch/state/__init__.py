@@ -1,1 +1,1 @@
-"""The state of cars: what is unknown of them, in which order, and what is known beforehand."""
+"""This package defines the state of cars: their unknowns, the order of these, and what is known beforehand."""

@@ -1,4 +1,4 @@
-"""The cars of a refinement: their state, the one place where it is updated, and what never changes about them."""
+"""This module defines the cars of a refinement: their state, and the constants that are known about them."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from directshape_torch.state.unknowns import Unknowns, blocks_of_car
 
 
 class CarState(NamedTuple):
-    """What is unknown of B cars that are refined by themselves: a `State`."""
+    """A `CarState` is the `State` of B cars that are each refined alone."""
 
     T_obj_cam: Tensor  # (B, 4, 4) left camera to object
     code: Tensor  # (B, K) standard deviations
-    offset_px: Tensor  # (B, S) measured minus true disparity, full-resolution pixels; S is 1, or 0 where it is known
+    # (B, S) measured minus true disparity, full-resolution pixels; S is 0 where the offset is known, else 1
+    offset_px: Tensor
 
     @classmethod
     def of(cls, T_obj_cam: Tensor, code: Tensor, num_offsets: int = 0) -> CarState:
-        """Cars of a pose (B, 4, 4) and a shape (B, K), where the rig's disparity is as it is calibrated."""
-        # No view of the code: compiled functions take other strides for another form.
+        """State of cars with poses (B, 4, 4), shapes (B, K) and offsets of zero."""
+        # The offsets are no view of the code, because compiled functions treat other strides as a new input form.
         return cls(T_obj_cam, code, code.new_zeros(len(code), num_offsets))
 
     @property
@@ -42,7 +43,7 @@ class CarState(NamedTuple):
 
 
 def move_by_disparity(state: CarState, focal_baseline: Tensor, offset_px: float | Tensor) -> CarState:
-    """Cars moved along the viewing ray of their origin so that its disparity grows by `offset_px`, (B,) or one."""
+    """Cars moved along the viewing ray of their origin so that its disparity grows by `offset_px`, (B,) or a number."""
     T_cam_obj = se3.inverse(state.T_obj_cam)
     origin = T_cam_obj[:, :3, 3]
     disparity = focal_baseline / origin[:, 2]
@@ -53,9 +54,9 @@ def move_by_disparity(state: CarState, focal_baseline: Tensor, offset_px: float 
 
 @dataclass(frozen=True)
 class CarBatch(Record):
-    """What the terms know of B cars beside their pixels; fixed for a whole refinement."""
+    """A `CarBatch` holds what the terms know of B cars besides their pixels; it is fixed for a whole refinement."""
 
-    num_detections: int  # of the call, refused ones among them
+    num_detections: int  # number of detections of the call, including refused ones
     detection_row: Tensor  # (B,) row of each car among the detections of the call
     frame_index: Tensor  # (B,) frame of each car
     input_depth: Tensor  # (B,) metres
@@ -66,20 +67,21 @@ class CarBatch(Record):
     ground_offset: Tensor  # (B,)
     detector_hwl: Tensor  # (B, 3)
     detector_T_cam_obj: Tensor  # (B, 4, 4) input pose
-    detector_pose_sigma: Tensor | None  # (B, 4) its standard deviations, see `Detections`, or None
-    # (B,) standard deviation of the unknown offset of the disparity; None where no car has one
+    detector_pose_sigma: Tensor | None  # (B, 4) standard deviations of the input pose, see `Detections`
+    # (B,) standard deviation of the unknown offset of the disparity; None where no car has an unknown offset
     offset_sigma_px: Tensor | None
-    field_sigma_px: Tensor  # (B,) that of the rig's disparity field at the car; 0 where the offset is an unknown
-    track_id: Tensor | None  # (B,) see `Detections`, or None
-    time_s: Tensor | None = None  # (B,) of each car's frame, see `FrameBatch`, or None
-    T_world_cam: Tensor | None = None  # (B, 4, 4) likewise
-    # (B, 7) standard deviations of the detector's boxes in `CAR_QUANTITIES`, metres, with which results are brought
-    # together; None where they are not
+    # (B,) standard deviation of the rig's disparity field at the car; 0 where the offset is an unknown
+    field_sigma_px: Tensor
+    track_id: Tensor | None  # (B,) see `Detections`
+    time_s: Tensor | None = None  # (B,) time of each car's frame, see `FrameBatch`
+    T_world_cam: Tensor | None = None  # (B, 4, 4) camera pose of each car's frame, see `FrameBatch`
+    # (B, 7) standard deviations of the detector's boxes in `CAR_QUANTITIES`, metres, with which results are combined
+    # with these boxes; None where results are not combined
     detector_noise: Tensor | None = None
 
     @classmethod
     def from_scene(cls, frames: FrameBatch, detections: Detections, disparity_sigma_px: float = 0.0) -> CarBatch:
-        """All cars of a call, with the rig's `disparity_sigma_px` where the detections bring no sigma of their own."""
+        """All cars of a call; `disparity_sigma_px` of the rig is used where the detections have no sigma."""
         f, offset_sigma_px = detections.frame_index, detections.offset_sigma_px
         if offset_sigma_px is None:
             offset_sigma_px = (
@@ -89,7 +91,7 @@ class CarBatch(Record):
             offset_sigma_px = None
         field_sigma_px = frames.camera.field_sigma_px(f, detections.T_cam_obj[:, :3, 3])
         if offset_sigma_px is not None:
-            # The unknown offset stands for the field.
+            # An unknown offset already accounts for the error of the disparity field.
             field_sigma_px = field_sigma_px.masked_fill(offset_sigma_px > 0, 0.0)
         return cls(
             num_detections=len(f),
@@ -118,28 +120,32 @@ class CarBatch(Record):
     def focal_over_depth(self) -> Tensor:
         """Focal length over INPUT depth (B,), pixels per metre.
 
-        Zeta comes from the input depth for the whole call, for a zeta that follows the state would let a car lower its
-        cost by moving. Divided when asked for, after cars without a depth were left out: no NaN in gradients.
+        Zeta comes from the input depth for the whole call, because a zeta that follows the state would let a car lower
+        its cost by moving. The division happens here, after cars without a depth were removed, so that gradients have
+        no NaN.
         """
         return self.K_left[:, 0, 0] / self.input_depth
 
     @property
     def focal_baseline(self) -> Tensor:
-        """Focal length times baseline (B,), pixel metres: disparity is this over depth."""
+        """Focal length times baseline (B,), pixel metres; divided by a depth it gives a disparity."""
         return -self.K_left[:, 0, 0] * self.T_right_cam[:, 0, 3]
 
     @property
     def num_offsets(self) -> int:
-        """S of the cars' states."""
+        """Number S of unknown offsets in the state of a car, 0 or 1."""
         return 0 if self.offset_sigma_px is None else 1
 
     def inverse_depth_of_offset(self, offset_px: Tensor) -> Tensor:
-        """What offsets (B, 1) of the disparity add to the inverse depth (B, 1), per metre; 0 where they are known."""
+        """Change of the inverse depth (B, 1), per metre, by offsets (B, 1) of the disparity; 0 where they are known."""
         assert self.offset_sigma_px is not None
         per_px = torch.where(self.offset_sigma_px > 0, 1 / self.focal_baseline, 0.0)
         return offset_px * per_px[:, None]
 
     def of_cars(self, keep: Tensor, numbers: Sequence[int] | None = None) -> CarBatch:
-        """Those of the cars where `keep` (B,) holds: `numbers` of them, should the host know it, who waits if not."""
+        """The batch of the cars where `keep` (B,) is true.
+
+        If the host knows the `numbers` of these cars, it need not wait for the device.
+        """
         index = keep.nonzero()[:, 0] if numbers is None else torch.nonzero_static(keep, size=len(numbers))[:, 0]
         return self.rows(index)

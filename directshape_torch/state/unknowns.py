@@ -1,7 +1,7 @@
-"""The unknowns of a car: the one place that knows which columns of a tangent they are, and how they move.
+"""This module defines the unknowns of a car: which columns of a tangent they are, and how a step moves them.
 
 A state is a named tuple with one tensor for each block of unknowns. Terms name the blocks that they see and give
-derivatives by those; everybody else asks `state.unknowns` for columns.
+derivatives by these blocks; all other code asks `state.unknowns` for columns.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.solver.problem import TensorTuple, remade
 
 POSE, CODE, OFFSET = "pose", "code", "offset"
-"""The blocks of every car: its pose, its shape, and the offset of the rig's disparity where that is a guess."""
+"""Every car has these blocks: its pose, its shape, and the offset of the rig's disparity where it is unknown."""
 
 _PoseOrShape = Literal["pose", "shape"]
 
 
 class Block(NamedTuple):
-    """Columns of the tangent that stand beside each other, and the tensor of a state that they move."""
+    """A block is a group of adjacent columns of the tangent, which move one tensor of a state."""
 
     name: str
-    size: int  # columns; none where a state has no such unknown
-    largest_step: tuple[float, ...] = (math.inf,)  # that is trusted, of each column or of all
-    # A stage that moves "pose" or "shape" alone holds the blocks of the other; nobody holds a block that is neither.
+    size: int  # number of columns; 0 where a state lacks this unknown
+    largest_step: tuple[float, ...] = (math.inf,)  # largest trusted step, one for each column or one for all
+    # A stage that moves only "pose" or only "shape" fixes the blocks of the other; a block with None always moves.
     belongs_to: _PoseOrShape | None = None
-    # A pose (B, 4, 4), or several (B, M, 4, 4), is moved by `exp` from the left, everything else by addition.
+    # A pose (B, 4, 4), or several (B, M, 4, 4), is multiplied by `exp` from the left; a step is added to other values.
     is_pose: bool = False
-    is_bounded: bool = False  # by the largest magnitude of a code
+    is_bounded: bool = False  # whether `max_code` limits the magnitude
 
     def moved(self, value: Tensor, step: Tensor, max_code: float, max_angle: float) -> Tensor:
         """The value of a state after a step (B, size)."""
@@ -44,17 +44,17 @@ class Block(NamedTuple):
         if not self.is_pose:
             moved = value + step
             return moved.clamp(-max_code, max_code) if self.is_bounded else moved
-        # A bound of the angle holds for steps within the trust region, which some poses have none of.
+        # The bound of the angle applies only to poses that have a trust region.
         max_angle = max_angle if math.isfinite(self.largest_step[0]) else math.inf
         flat = value.flatten(0, -3)
         return torch.bmm(se3.exp(step.reshape(-1, 6), max_angle), flat).view_as(value)
 
 
 def blocks_of_car(num_codes: int, num_offsets: int) -> tuple[Block, ...]:
-    """The blocks of a car by itself.
+    """The blocks of a car that is refined alone.
 
-    Trust region: a larger step is scaled as a whole. A rig that is off by a pixel more between two iterations is
-    another rig.
+    The largest steps form a trust region: a step that exceeds one of them is scaled as a whole. The offset of a rig
+    changes by at most one pixel in an iteration.
     """
     return (
         Block(POSE, 6, (0.5, 0.5, 0.5, 0.15, 0.15, 0.15), "pose", is_pose=True),
@@ -64,11 +64,11 @@ def blocks_of_car(num_codes: int, num_offsets: int) -> tuple[Block, ...]:
 
 
 LARGEST_ROTATION_RAD = math.sqrt(3) * 0.15
-"""No step within the trust region turns a car by more, for none of three components is larger than its limit."""
+"""A step within the trust region turns a car by at most this angle, because its three components are limited."""
 
 
 class State(TensorTuple, Protocol):
-    """Pose and shape of B cars, and what else is unknown of them: a named tuple."""
+    """A state is a named tuple of the poses, the shapes and the other unknowns of B cars."""
 
     @property
     def T_obj_cam(self) -> Tensor:
@@ -82,12 +82,12 @@ class State(TensorTuple, Protocol):
 
     @property
     def offset_px(self) -> Tensor:
-        """Measured minus true disparity (B, S), full-resolution pixels; S is 1, or 0 where it is known."""
+        """Measured minus true disparity (B, S), full-resolution pixels; S is 0 where the offset is known, else 1."""
         ...
 
     @property
     def unknowns(self) -> Unknowns:
-        """Blocks of the tangent, one for each tensor in its order."""
+        """Blocks of the tangent, one for each tensor of the state, in the order of the state."""
         ...
 
 
@@ -96,7 +96,7 @@ AnyState = TypeVar("AnyState", bound=State)
 
 @dataclass(frozen=True)
 class Unknowns:
-    """The blocks of a state, which are those of its tangent.
+    """`Unknowns` are the blocks of a state, in the order of the columns of its tangent.
 
     Examples:
         >>> unknowns = Unknowns(blocks_of_car(num_codes=3, num_offsets=1))
@@ -112,7 +112,7 @@ class Unknowns:
         return sum(block.size for block in self.blocks)
 
     def span(self, *names: str) -> slice:
-        """The columns of blocks that stand beside each other."""
+        """The columns of adjacent blocks."""
         first, last = (self._names().index(name) for name in (names[0], names[-1]))
         between = [block for block in self.blocks[first : last + 1] if block.size or block.name in names]
         assert tuple(block.name for block in between) == names, f"{names} do not stand beside each other"
@@ -129,9 +129,9 @@ class Unknowns:
         return torch.cat([number[self.span(name)] for name in names])
 
     def placed(self, J: Tensor, sees: Sequence[str]) -> Tensor:
-        """A Jacobian (..., D) by all unknowns from that by the blocks which a residual `sees`, in their order.
+        """A Jacobian (..., D) by all unknowns, from a Jacobian by the blocks that a residual `sees`, in this order.
 
-        A Jacobian that has all D columns stays as it is.
+        A Jacobian that already has all D columns is returned unchanged.
 
         Examples:
             >>> Unknowns(blocks_of_car(num_codes=2, num_offsets=1)).placed(torch.ones(1, 2), ["code"])
@@ -155,21 +155,24 @@ class Unknowns:
     def retract(
         self, state: AnyState, delta: Tensor, max_code: float = torch.inf, max_angle: float = torch.inf
     ) -> AnyState:
-        """`T_obj_cam <- exp(v, omega) T_obj_cam`, `code <- code + dcode` within its bound, the others likewise.
+        """Move a state by a step of the tangent.
+
+        The step gives `T_obj_cam <- exp(v, omega) T_obj_cam` and, within its bound, `code <- code + dcode`; any other
+        block moves as its fields `is_pose` and `is_bounded` say.
 
         Args:
             state: B cars with these unknowns.
             delta: (B, D) of the blocks in their order: of a pose `(v, omega)` in metres and radians, of the code
                 standard deviations, of the offset pixels.
             max_code: largest magnitude of a code component.
-            max_angle: no rotation is larger, radians (see `se3.exp`).
+            max_angle: largest angle of a rotation, radians (see `se3.exp`).
         """
         steps = delta.to(state.code.dtype).split_with_sizes([block.size for block in self.blocks], dim=1)
         values = zip(self.blocks, state, steps, strict=True)
         return remade(state, (block.moved(value, step, max_code, max_angle) for block, value, step in values))
 
     def largest_steps(self, device: torch.device) -> Tensor:
-        """The largest trusted step (D,) of each unknown, float64; not to be written to."""
+        """The largest trusted step (D,) of each unknown, float64; the caller must not write to this tensor."""
         limits = [
             limit
             for b in self.blocks
@@ -178,12 +181,12 @@ class Unknowns:
         return constant_like(tuple(limits), torch.empty(0, dtype=torch.float64, device=device))
 
     def moving(self, moves: Literal["both", "pose", "shape"], device: torch.device) -> Tensor:
-        """Unknowns (D,) bool that a stage moves."""
+        """Mask (D,) of the unknowns that a stage moves."""
         moved = [block.belongs_to in (None, moves) or moves == "both" for block in self.blocks]
         return self._by_column(moved, device)
 
     def free(self, state: State, max_code: float) -> Tensor:
-        """Unknowns (B, D) bool of a state that no bound holds: a code component at its bound is a constant."""
+        """Mask (B, D) of the unknowns that may move: a code component at its bound is a constant."""
         free = torch.ones_like(state.code[:, :1], dtype=torch.bool).expand(-1, self.size).clone()
         values = zip(self.blocks, state, pairwise(self._borders()), strict=True)
         for block, value, (first, last) in values:
