@@ -1,1 +1,1 @@
-"""The views of a tracked car, which have one shape, follow a path, and see each other: a room above the core."""
+"""This package refines the views of a tracked car together: they have one shape, follow a path and see each other."""

@@ -1,9 +1,10 @@
-"""The left image of a view of a track against that of the next view, warped there through the car's own surface.
+"""This term compares the left image of a view with the left image of the next view, warped through the car's surface.
 
-`1 / |Omega| sum_p w_p ||I_next(pi(T_next_obj X(p))) - I(p)||`: X(p) is the surface under pixel p, T_next_obj the pose
-of the car in the next view. Both poses are unknown, so how the camera moves need not be known: between two frames car
-and camera move by metres against each other, where the pair of a rig has half a metre. Pixels are those of the
-photometric term that the next view shows too. Derivation: docs/derivations/tracks.md.
+The cost is `1 / |Omega| sum_p w_p ||I_next(pi(T_next_obj X(p))) - I(p)||`, where X(p) is the surface under pixel p and
+T_next_obj is the pose of the car in the next view. Both poses are unknown, so the motion of the camera need not be
+known. Between two frames the car and the camera move by metres relative to each other, while the baseline of a rig is
+half a metre. The term uses the pixels of the photometric term that the next view shows too. The derivation is in
+docs/derivations/tracks.md.
 """
 
 from __future__ import annotations
@@ -39,60 +40,60 @@ from directshape_torch.terms.term import Linear, Sight, Term
 from directshape_torch.tracks.state import NEXT_POSE, TrackState
 
 NEXT_VIEW_NAME = "next_view"
-# What is not so far in front of the next camera is not seen by it.
+# The next camera sees only points with at least this depth.
 _LEAST_DEPTH_M = 0.1
-# Where two views are compared by their looks: pixels of the level that one may lie beside the other, and what is added
-# to the variance of grey levels, the square of this, so that weak noise on an even car makes no difference.
+# The likeness of two views allows a shift by this number of pixels of the pyramid level. The square of the floor is
+# added to the variance of grey levels, so that weak noise on an even car makes no difference.
 _MOST_SHIFT_PX, _CONTRAST_FLOOR = 3, 5.0
 
 
 class NextViews(NamedTuple):
-    """The next view of each of B views."""
+    """`NextViews` describes the next view of each of B views."""
 
-    exists: Tensor  # (B,) bool: not so of the last view of a track
+    exists: Tensor  # (B,) bool, false for the last view of a track
     frame_index: Tensor  # (B,)
     detection_row: Tensor  # (B,)
     K_left: Tensor  # (B, 3, 3)
 
     @classmethod
     def of(cls, cars: CarBatch, next_view: Tensor) -> NextViews:
-        """From the number (B,) of the next view; the last one of a track has its own."""
+        """Next views from their numbers (B,); the last view of a track has its own number."""
         exists = next_view != torch.arange(len(next_view), device=next_view.device)
         return cls(exists, *(x[next_view] for x in (cars.frame_index, cars.detection_row, cars.K_left)))
 
 
 class NextImage(NamedTuple):
-    """What the pixels of M blocks are compared with in a stage."""
+    """`NextImage` holds what the pixels of M blocks are compared with in a stage."""
 
-    pixels: Tensor  # (A,) grey levels of all left images at the pyramid level, behind one another
+    pixels: Tensor  # (A,) grey levels of all left images at the pyramid level, one after another
     frame: Tensor  # (M, 4) see `RightView`
-    K: Tensor  # (M, 3, 3) of the next camera, at the level
-    grey: Tensor  # (M, 64) of the pixels, brought to the brightness of the next image
-    weight: Tensor  # (M, 64) of the pixels; zero for those that the next view does not show
+    K: Tensor  # (M, 3, 3) intrinsics of the next camera at the pyramid level
+    grey: Tensor  # (M, 64) grey levels of the pixels, brought to the brightness of the next image
+    weight: Tensor  # (M, 64) weights of the pixels; zero where the next view does not show the pixel
 
     def at(self, u: Tensor, v: Tensor) -> BilinearPatch:
-        """The image at points (M, 64) at the level."""
+        """The image at points (M, 64) of the pyramid level."""
         first_pixel, row_step, last_column, last_row = self.frame.mT[..., None]
         return bilinear_patch(self.pixels, first_pixel, row_step, u, v, last_column, last_row)
 
 
 class LookedUp(NamedTuple):
-    """Points (3, M, 64) of cars in their next image."""
+    """`LookedUp` is what the next images show at points (3, M, 64) of cars."""
 
-    u: Tensor  # (M, 64) at the level
-    v: Tensor
+    u: Tensor  # (M, 64) column at the pyramid level
+    v: Tensor  # (M, 64) row at the pyramid level
     value: Tensor  # (M, 64) grey levels
     J_value_point: Tensor  # (3, M, 64) per metre in the object frame
-    inside: Tensor  # (M, 64) bool: in the image, and in front of the camera
+    inside: Tensor  # (M, 64) bool, whether the point is in the image and in front of the camera
 
 
 @dataclass(frozen=True)
 class NextViewEvidence:
-    """What the left images show of B views and of the next one of each: an `Evidence`."""
+    """This `Evidence` is what the left images show of B views and of the next view of each."""
 
     weight: float  # of the term
-    stereo: PhotometricEvidence  # of the B views
-    next_views: NextViews  # of these views
+    stereo: PhotometricEvidence  # photometric evidence of the B views
+    next_views: NextViews  # next views of the B views
 
     names = (NEXT_VIEW_NAME,)
 
@@ -132,11 +133,11 @@ class NextViewEvidence:
 
 @dataclass(frozen=True)
 class NextView(Term):
-    """The term of a stage; see module."""
+    """A `NextView` is the term of a stage; the docstring of the module gives its cost."""
 
     weight: float  # of the term
-    stereo: Photometric  # the photometric term of the B views, whose pixels and surfaces these are
-    next_views: NextViews  # of these views
+    stereo: Photometric  # photometric term of the B views, with their pixels and surfaces
+    next_views: NextViews  # next views of the B views
     image: NextImage  # what the pixels are compared with
 
     names = NextViewEvidence.names
@@ -148,7 +149,7 @@ class NextView(Term):
 
     @property
     def block_weight(self) -> Tensor:
-        # A mean over all pixels of the view, so that few in common say little.
+        # The mean is over all pixels of the view, so that a few common pixels have little weight.
         return self.weight / self.stereo.pixel_set.support.clamp_min(1)[self.blocks.owner]
 
     @property
@@ -160,7 +161,7 @@ class NextView(Term):
         return self.image.weight[..., None]
 
     def looked_up(self, state: State, points_obj: Tensor) -> LookedUp:
-        """Points (3, M, 64) of cars in their next image."""
+        """What the next images show at points (3, M, 64) of cars."""
         assert isinstance(state, TrackState)
         image, owner = self.image, self.blocks.owner
         T_next_obj = se3.inverse(state.T_obj_next[:, 0])[owner]
@@ -186,7 +187,7 @@ class NextView(Term):
         residual = torch.where(usable, at.value - self.image.grey, self.stereo.config.lost_grey_levels)
         J_depth = (at.J_value_point * surface.rays.direction_obj).sum(0)[..., None] * surface.J_depth_state
         J_value_point, points = at.J_value_point.movedim(0, -1), points.movedim(0, -1)
-        # The next camera sees a point that stands still in this one by both poses, with opposite signs.
+        # A point that is fixed in this camera moves in the next one by both poses, with opposite signs.
         J_pose = torch.cat([J_value_point, cross(points, J_value_point)], dim=-1)
         J = torch.cat([J_depth + torch.nn.functional.pad(J_pose, (0, state.code.shape[1])), -J_pose], dim=-1)
         one = usable[..., None].to(J.dtype)
@@ -202,10 +203,10 @@ class NextView(Term):
         return robust.huber(residual, self.stereo.config.huber_grey_levels)
 
     def likeness(self, sight: Sight) -> tuple[Tensor, Tensor]:
-        """How alike (B,) each view and the next are: the correlation of the grey levels of the pixels seen in both.
+        """Return how alike (B,) each view and the next are, and how many pixels (B,) are seen in both.
 
-        The largest one with the next image moved by up to `_MOST_SHIFT_PX`: views that lie a little beside each other
-        are of one car all the same. Behind it how many pixels (B,) are seen in both.
+        The likeness is the correlation of the grey levels of the pixels seen in both. It is the largest correlation
+        over shifts of the next image by up to `_MOST_SHIFT_PX`, because views of one car may be slightly shifted.
         """
         where, owner, image = self.where(sight), self.blocks.owner, self.image
         at = self.looked_up(sight.state, where.points_obj)

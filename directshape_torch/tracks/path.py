@@ -1,9 +1,10 @@
-"""A car's way through the frames of its track: a smooth path on the ground, from which each view may deviate.
+"""This module models a car's way through the frames of its track: a smooth path, from which each view may deviate.
 
-The path is `(x, z, heading)(t) = p + v t + a t^2 / 2`, nine unknowns that the views of a track share as they share the
-code; t is in seconds from the middle of the track, x and z are axes of the camera of its first view, or of the camera
-that moves where nobody has said how it does. Constant velocity and turn rate is what `a` is held to. So a row sees its
-own view and the path, never another view. Derivation: docs/derivations/tracks.md.
+The path is `(x, z, heading)(t) = p + v t + a t^2 / 2` on the ground. Its nine unknowns are shared by the views of a
+track, as the code is. The time t is in seconds from the middle of the track. The axes x and z belong to the camera of
+the first view, or to the moving camera of each view where the motion of the camera is unknown. A prior pulls `a` to
+zero, that is, to constant velocity and turn rate. A row depends on its own view and on the path, never on another view.
+The derivation is in docs/derivations/tracks.md.
 """
 
 from __future__ import annotations
@@ -25,22 +26,23 @@ from directshape_torch.tracks.state import PATH, TrackState
 
 NUM_PATH = 9
 MOTION_NAMES = ("path", "acceleration")
-# Of squared standard deviations, as that of the detector's pose.
+# This is the weight of squared standard deviations; the detector's pose has an equal weight.
 MOTION_WEIGHT = 0.2
-# A track of which a view, refined by itself, is further from the path than so many standard deviations, its own taken
-# for this share of its distance and these radians, goes along none or is not of one car: next to nothing holds it.
+# A track has no fitting path, or is not of one car, if a view that was refined alone is more than `_FURTHEST` standard
+# deviations from the path; the view's own error is taken as `_OWN_SHARE` of its distance and `_OWN_HEADING` radians.
+# The motion prior of this track then has the factor `_NEXT_TO_NOTHING`.
 _FURTHEST, _OWN_SHARE, _OWN_HEADING, _NEXT_TO_NOTHING = 3.0, 0.01, 0.05, 1e-4
-# An acceleration lasts about so long: what it changes by is what a view so far from the middle may deviate.
+# An acceleration lasts about this long; its rate of change lets views deviate that are far from the middle of a track.
 _STEADY_S = 0.3
 
 
 def follow_paths(config: TracksConfig, cars: CarBatch) -> bool:
-    """Whether times are known, and paths wanted."""
+    """Whether times are known and paths are requested."""
     return cars.time_s is not None and config.path_sigma_m > 0
 
 
 def motion_terms(config: TracksConfig, cars: CarBatch) -> list[PriorTerm]:
-    """What holds views to their path, and the path to constant velocity; none where cars follow no path."""
+    """Priors that pull views to their path and the path to constant velocity; empty where cars follow no path."""
     if not follow_paths(config, cars):
         return []
 
@@ -59,7 +61,9 @@ def _of_acceleration(config: TracksConfig) -> tuple[float, float, float]:
 
 
 def deviation_sigma(config: TracksConfig, time_s: Tensor) -> Tensor:
-    """Standard deviations (B, 3) of x, z and heading about a path, a Taylor series, at times (B,) from its middle.
+    """Standard deviations (B, 3) of x, z and heading about a path, at times (B,) from its middle.
+
+    The path is a Taylor series, so its error grows with the third power of the time.
 
     Examples:
         >>> deviation_sigma(TracksConfig(path_sigma_m=0.1, acceleration_sigma_mps2=1.8), torch.tensor([0.0, 1.0]))[:, 0]
@@ -71,9 +75,9 @@ def deviation_sigma(config: TracksConfig, time_s: Tensor) -> Tensor:
 
 
 def path_prior(cars: CarBatch, state: TrackState, config: TracksConfig) -> PriorResidual:
-    """Place on the ground and heading against the path (B, 9), in standard deviations.
+    """Residual of the place on the ground and of the heading against the path (B, 9), in standard deviations.
 
-    Of the heading the sine: a car that a detector took for one that drives backwards pulls at nobody.
+    The heading counts by its sine, so that a car detected with the opposite heading pulls at nothing.
     """
     place, heading, J_v, J_omega = _on_the_ground(cars, state.T_obj_cam)
     basis = _basis(cars)
@@ -104,9 +108,10 @@ def acceleration_prior(state: TrackState, sigma: tuple[float, float, float]) -> 
 def with_path(
     config: TracksConfig, sharing: Groups, cars: CarBatch, state: TrackState, say: Tensor | None = None
 ) -> TrackState:
-    """States (R) with the path of each group that fits its views best; as they are where there is no motion prior.
+    """Return states (R) with the path of each group that fits its views best.
 
-    `say` (R,) are weights of views, by default alike.
+    States are returned unchanged where there is no motion prior. The weights of the views are `say` (R,), by default
+    equal.
     """
     if not follow_paths(config, cars):
         return state
@@ -127,7 +132,10 @@ def with_path(
 
 
 def _continuous(sharing: Groups, time_s: Tensor, heading: Tensor) -> Tensor:
-    """Headings (R,) of which each is the nearest to that of the view before it in time, or to its opposite."""
+    """Headings (R,) without jumps in time.
+
+    Each heading is shifted by a multiple of half a turn, so that it is nearest to the heading of the previous view.
+    """
     order = time_s[sharing.rows].masked_fill(~sharing.filled, torch.inf).argsort(dim=1, stable=True)
     rows, filled = sharing.rows.gather(1, order), sharing.filled.gather(1, order)
     in_order = heading[rows]
@@ -138,9 +146,9 @@ def _continuous(sharing: Groups, time_s: Tensor, heading: Tensor) -> Tensor:
 
 
 def hold_of_path(config: TracksConfig, sharing: Groups, cars: CarBatch, alone: State, trusted: Tensor) -> Tensor:
-    """Factor (R,) of what deviations cost views that ended here by themselves: 1 where a path fits their track.
+    """Factor (R,) of the motion prior for views with the states `alone`: 1 where a path fits their track.
 
-    A view that is not trusted (R,) may be far from it: the path may bring it back.
+    A view that is not `trusted` (R,) may be far from the path, because the path may bring it back.
     """
     trusted = trusted | ~sharing.any(trusted)
     fitted = with_path(config, sharing, cars, TrackState.of(alone), torch.where(trusted, 1.0, _NEXT_TO_NOTHING))
@@ -156,7 +164,7 @@ def hold_of_path(config: TracksConfig, sharing: Groups, cars: CarBatch, alone: S
 
 
 def timed(sharing: Groups, cars: CarBatch) -> CarBatch:
-    """Views with times from the middle of their track, and poses of the camera in that of its first view."""
+    """Views with times from the mean time of their track, and poses of the camera in the camera of its first view."""
     if cars.time_s is None:
         return cars
     T_path_cam = cars.T_world_cam
@@ -177,10 +185,10 @@ def _basis(cars: CarBatch) -> Tensor:
 
 
 def _on_the_ground(cars: CarBatch, T_obj_cam: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Place (B, 2) and heading (B,) in the axes of the path, and their derivatives by v and by omega."""
+    """Place (B, 2) and heading (B,) in the axes of the path; derivatives of the place by v, of the heading by omega."""
     T_path_obj = se3.inverse(T_obj_cam)
     if cars.T_world_cam is not None:
         T_path_obj = cars.T_world_cam @ T_path_obj
     R = T_path_obj[:, :3, :3]
-    # The origin moves by -R_path_obj v.
+    # The origin of the object moves by -R_path_obj v.
     return T_path_obj[:, 0:3:2, 3], torch.atan2(-R[:, 2, 0], R[:, 0, 0]), -R[:, 0::2], J_heading_omega(R)

@@ -1,7 +1,7 @@
-"""Whether the views of a track are of one car: what each says of its shape, and whether it looks like the next.
+"""This module decides whether the views of a track are of one car, by their shapes and by their likeness.
 
-Ids of trackers pass from one car to another: a track is cut in time where what two shapes save and how unlike the next
-view looks are too much together. Derivation: docs/derivations/tracks.md.
+The id of a tracker may pass from one car to another. A track is therefore cut in time where the cost that two shapes
+save and the unlikeness of the next view are together too large. The derivation is in docs/derivations/tracks.md.
 """
 
 from __future__ import annotations
@@ -22,53 +22,56 @@ from directshape_torch.terms.term import Sight
 from directshape_torch.tracks.next_view import NextView
 from directshape_torch.tracks.state import own_and_shared
 
-# Evidence that the sides of a cut are of two cars is twice the cost that two shapes save, and so many times how unlike
-# the next view is; up to a limit they are of one car. Chosen on 445 cuts through rendered and real tracks of one car:
-# two exceed it, where the sky appears in the windows, the others reach 8.7.
+# The evidence that the sides of a cut are of two cars is twice the cost that two shapes save plus `_UNLIKE` times the
+# unlikeness of the next view; up to `_MOST_EVIDENCE` they count as one car. Both were chosen on 445 cuts through
+# rendered and real tracks of one car: two cuts exceed the limit, where the sky appears in the windows; the others reach
+# 8.7.
 _MOST_EVIDENCE, _UNLIKE = 9.0, 30.0
-# Reflections change as a car turns: so much less like is a view of it per degree, and at most.
+# Reflections change as a car turns: the likeness of a view may drop by this much per degree, up to this maximum.
 _LESS_LIKE_PER_DEG, _LESS_LIKE_BY_TURNING = 0.02, 0.25
-# Fewer pixels say nothing. Views that share less than this share of the pixels of the smaller one are of a car that has
-# turned far, or of two: that counts as so unlike, which by itself is not enough. Of those 445 pairs the least is 0.34.
+# With fewer than `_FEWEST_PIXELS` pixels, likeness is unknown. Two views are of a car that turned far, or of two, if
+# their common pixels are less than `_LEAST_SHARE` of the pixels of the smaller view. Their unlikeness is then
+# `_UNLIKE_WITHOUT_SHARE`, which alone does not cut a track. In 445 pairs of views of one car the least share is 0.34.
 _FEWEST_PIXELS, _LEAST_SHARE, _UNLIKE_WITHOUT_SHARE = 20, 0.1, 0.2
-# A mask that comes so near to the border of its image is cut off.
+# A mask within this distance of the border of its image counts as cut off.
 _BORDER_PX = 2
 
 
 Parts: TypeAlias = list[list[list[int]]]
-"""Of each track its parts, each the rows of the views of one car in the order of time."""
+"""`Parts` lists the parts of each track; a part lists the rows of the views of one car in the order of time."""
 
 
 @dataclass(frozen=True)
 class SaidOfShape:
-    """What each of B views says of its code about where it ended, its pose following: `c^T A c / 2 - b^T c`.
+    """`SaidOfShape` is the cost of each of B views as a quadratic in its code c: `c^T A c / 2 - b^T c`.
 
-    A view that is not trusted says nothing (A and b are 0): that it ended elsewhere is no sign of another car. Where a
-    track is cut beside it, it goes with the later views.
+    The quadratic is taken where the view ended, and the pose follows the code. A view that is not trusted has A = 0 and
+    b = 0, because its different end is no sign of another car. If a track is cut next to this view, the view goes with
+    the later views.
     """
 
     A: Tensor  # (B, K, K)
     b: Tensor  # (B, K, 1)
-    anything: Tensor  # (B,) bool: there is such a quadratic, so that it can share a shape, trusted or not
+    anything: Tensor  # (B,) bool, whether the view has a quadratic, trusted or not, and can share a shape
 
     @classmethod
     def at(cls, minimum: Minimum[CarState]) -> SaidOfShape:
-        """Of B cars where each ended by itself."""
+        """The quadratics of B cars where each ended when refined alone."""
         hessian = minimum.after.hessian.sum(dim=1)
         nothing = torch.zeros_like(hessian[:, 0])
         _, solvable = damped_step(hessian, nothing, nothing[:, 0])
-        # All slopes of a minimum add up to nothing.
+        # The gradient at a minimum is zero.
         A, _, has_any = said_of_shared(hessian, nothing, *own_and_shared(minimum.end))
         trusted = torch.where(is_refined(minimum.status)[:, None, None], A, 0.0)
         return cls(trusted, trusted @ minimum.end.code.to(A)[:, :, None], solvable & has_any)
 
     def saved(self, views: list[int]) -> Tensor:
-        """Twice the cost (V - 1,) that is saved if before and after each cut in time have a shape of their own."""
+        """Twice the cost (V - 1,) that each cut in time saves if its two sides have different shapes."""
         index = torch.tensor(views, device=self.A.device)
         A, b = (x.index_select(0, index).cumsum(dim=0) for x in (self.A, self.b))
 
         def twice_least(A: Tensor, b: Tensor) -> Tensor:
-            # Views that say nothing have the least 0, wherever it is.
+            # Views without information have the minimum 0 for all codes.
             solution: Tensor = torch.linalg.solve_ex(A, b)[0].nan_to_num(0.0, 0.0, 0.0)
             return -(b * solution).sum(dim=(1, 2))
 
@@ -78,9 +81,9 @@ class SaidOfShape:
 
 @torch.no_grad()
 def unlikeness(term: NextView, is_cut: Tensor, seen_end: Sight, next_view: Tensor) -> Tensor:
-    """How much less like the next (B,) each of B views of tracks is than a turning car explains; 0 if nobody knows.
+    """Unlikeness (B,) of each of B views and the next one, beyond what a turning car explains; 0 if it is unknown.
 
-    The image ends within the mask of views that are cut, `is_cut` (B,).
+    `is_cut` (B,) marks views whose mask is cut off by the border of the image.
     """
     alike, count = term.likeness(seen_end)
     towards = torch.nn.functional.normalize(seen_end.state.T_obj_cam[:, :3, 3], dim=1)
@@ -97,7 +100,7 @@ def unlikeness(term: NextView, is_cut: Tensor, seen_end: Sight, next_view: Tenso
 
 
 def is_cut_off(stereo: PhotometricEvidence) -> Tensor:
-    """Whether (B,) the left image ends within the mask of each car, at the left or right or below."""
+    """Whether (B,) the left, right or lower border of the left image cuts off the mask of each car."""
     left, cars = stereo.left, stereo.cars
     height, width = left.pyramid[0].sizes[cars.frame_index].unbind(1)
     u0, _, u1, v1 = left.mask_left.extents[cars.detection_row].unbind(1)
@@ -105,12 +108,12 @@ def is_cut_off(stereo: PhotometricEvidence) -> Tensor:
 
 
 def parts_by_shape(cars: CarBatch, says: SaidOfShape, joins: Tensor) -> Parts:
-    """The parts of each track of B cars: rows of the views of one car, in the order of times, or of frames.
+    """Return the parts of each track of B cars: rows of the views of one car, in the order of times or of frames.
 
     Args:
-        cars: with their tracks.
-        says: what each says of its shape.
-        joins: (B,) bool, which may share a shape.
+        cars: B cars with their tracks.
+        says: what each car says of its shape.
+        joins: (B,) bool, cars that may share a shape.
     """
     assert cars.track_id is not None
     views: dict[int, list[int]] = {}
@@ -127,9 +130,10 @@ def parts_by_shape(cars: CarBatch, says: SaidOfShape, joins: Tensor) -> Parts:
 
 
 def cut_once(parts: Parts, says: SaidOfShape, unlike: Tensor) -> Parts:
-    """The parts, each cut in time where there is most evidence of two cars, if that is too much.
+    """Return the parts, each cut in time where the evidence of two cars is largest, if it exceeds the limit.
 
-    Once, for where two cars were made one the looks of its other views suffer too. `unlike` (B,) is `unlikeness`.
+    Each part is cut at most once, because two cars in one part also spoil the likeness of its other views. `unlike`
+    (B,) is the result of `unlikeness`.
     """
     return [[piece for part in of_track for piece in _of_one_car(part, says, unlike)] for of_track in parts]
 

@@ -1,8 +1,9 @@
-"""Views of a track, each refined by itself, brought together: one shape, and steps in common.
+"""This module refines the views of a track together, with one shape, after each view was refined alone.
 
-So what each says of the shape is known before they are made to agree. A view that is not trusted in its track keeps
-what it was alone. One that fails in it, or was not trusted alone either, leaves, and the others are brought together
-again; so they are, in parts, where it shows that a track is not of one car.
+What each view says of the shape is thus known before the views agree. A view that is not trusted in its track keeps its
+result from the refinement alone. A view that fails in the track, or is trusted neither there nor alone, leaves the
+track, and the other views are refined together again. Where a track proves to be of more than one car, its parts are
+refined together again.
 """
 
 from __future__ import annotations
@@ -29,20 +30,20 @@ from directshape_torch.tracks.path import MOTION_NAMES, hold_of_path, motion_ter
 from directshape_torch.tracks.same_car import Parts, SaidOfShape, cut_once, is_cut_off, parts_by_shape, unlikeness
 from directshape_torch.tracks.state import NEXT_POSE, PATH, TrackState, own_and_shared
 
-# Of a track, times those of the last stage.
+# A track has this many times the iterations of the last stage.
 _MORE_ITERATIONS = 2
-# Errors of two views of one rendered car, each refined by itself, correlate by 0.5 in depth, 0.3 across and 0.8 in
-# length: this share of a view's covariance is common to all of its track, who do not reduce it.
+# Errors of two views of one rendered car, each refined alone, correlate by 0.5 in depth, 0.3 across and 0.8 in length.
+# This share of a view's covariance is therefore common to all views of its track, and more views leave it unreduced.
 _IN_COMMON = 0.5
 
 
 def brought_together(
     problem: CarProblem, cars: CarBatch, initial: CarState, came: RefinementResult
 ) -> RefinementResult:
-    """The result of B cars, some of which are views of tracks, with the graph of the backward mode.
+    """Return the result of B cars, some of which are views of tracks, with the graph of the backward mode.
 
     Args:
-        problem: of these cars, each by itself.
+        problem: the problem of these cars, each refined alone.
         cars: the cars, with their tracks.
         initial: input states.
         came: what is known of the cars beforehand.
@@ -59,8 +60,8 @@ def brought_together(
         in_track = views.refined(take_rows(initial, views.rows), came.rows(views.rows))
         leaves = views.leaving(in_track, doubtful[views.rows])
         if bool(leaves.any()):
-            # What the others know once they know without it: from the beginning. Before any cut by looks, which differ
-            # from what they should be where a view is placed wrongly.
+            # The other views start again without the views that leave. This comes before any cut by likeness, because a
+            # view in a wrong place falsifies the likeness.
             joins = joins.index_fill(0, views.rows[leaves], False)
             parts = parts_by_shape(alone.cars, says, joins)
             continue
@@ -74,15 +75,15 @@ def brought_together(
 def _joined(
     alone: Refined[CarState], views: Views, in_track: Refined[TrackState], initial: CarState
 ) -> RefinementResult:
-    """What is said of all cars, once no view leaves its track and no track is cut."""
+    """The result of all cars, after the last view has left its track and the last track has been cut."""
     status, rows = in_track.minimum.status, views.rows
     chosen = is_refined(status).nonzero()[:, 0]
     ends = is_refined(alone.minimum.status).index_fill(0, rows[chosen], False)
     if alone.problem.config.backward.mode == "unroll" and torch.is_grad_enabled():
-        # Where views began together has a part in gradients by repeated steps, in no others.
+        # Only gradients by repeated steps depend on the states from which views began together.
         ends = ends | views.keep
     states = alone.states(initial, ends)
-    # A track's steps depend on all of its views, trusted or not.
+    # The steps of a track depend on all of its views, trusted or not.
     everybody = torch.ones_like(rows, dtype=torch.bool)
     of_views = in_track.states(views.agreed(take_rows(states, rows)), everybody)
     in_common = torch.lerp(in_track.found.covariance, alone.found.covariance[rows], _IN_COMMON)
@@ -94,23 +95,23 @@ def _joined(
 
 @dataclass(frozen=True)
 class Views:
-    """R views that share a shape with others."""
+    """`Views` are R views that share a shape with other views."""
 
-    keep: Tensor  # (B,) bool, which of the cars of the call they are
-    rows: Tensor  # (R,) their numbers
-    problem: CarProblem  # of these views, its last stage alone
-    agreement: Groups  # whose codes are one
-    cars: CarBatch  # of all B cars
-    timed: CarBatch  # the views, with times and cameras of their track
-    alone: CarState  # where they ended by themselves
-    hessian: Tensor  # (R, D, D) of what each adds to the cost of its track there
-    part: Tensor  # (R,) of its track, 0 unless it was split
-    next_view: Tensor  # (R,) number of the next view of its part in time, of the last one its own
+    keep: Tensor  # (B,) bool, cars of the call that are these views
+    rows: Tensor  # (R,) numbers of the views among the cars
+    problem: CarProblem  # problem of these views, with the last stage alone
+    agreement: Groups  # groups of views that share a code
+    cars: CarBatch  # all B cars
+    timed: CarBatch  # the views, with times and cameras relative to their track
+    alone: CarState  # states where the views ended when refined alone
+    hessian: Tensor  # (R, D, D) Hessian of the cost of each view at `alone`
+    part: Tensor  # (R,) number of the part of its track, 0 unless the track was split
+    next_view: Tensor  # (R,) number of the next view of its part in time; the last view has its own number
 
     @classmethod
     def of(cls, alone: Refined[CarState], parts: Parts) -> Views | None:
-        """The views (rows of B cars) of each part of each track; None where nobody shares a shape."""
-        # Of each view its group, its place there, the view in the next place, and the number of the part of its track.
+        """The views of each part of each track, with rows of B cars; None where no cars share a shape."""
+        # A view has a group, a place in it, the view in the next place, and the number of the part of its track.
         views_of_parts: dict[int, tuple[int, int, int, int]] = {}
         for parts_of_track in parts:
             for number, part in enumerate(parts_of_track):
@@ -134,14 +135,15 @@ class Views:
         return cls(keep, rows, problem, sharing, alone.cars, views, ends, hessian, part_number, next_view)
 
     def refined(self, initial: CarState, came: RefinementResult) -> Refined[TrackState]:
-        """The views refined together, from the shape on which they agree."""
+        """The views refined together, starting from the shape on which they agree."""
         cars = self.cars.of_cars(self.keep)
         return Refined.of(self.problem, cars, self.linked(initial), self.agreed(self.alone), came)
 
     def agreed(self, alone: CarState) -> TrackState:
-        """States (R) with the one shape on which the views agree best, and poses as they go with it.
+        """Return states (R) with the one shape on which the views agree best, and with the poses that belong to it.
 
-        Each view's cost is a quadratic about where it ended by itself; the sum of a track's has its least at one code.
+        The cost of each view is a quadratic about the state where it ended alone; the sum of the quadratics of a track
+        has its minimum at one code.
         """
         unknowns = alone.unknowns
         of_code, max_code = unknowns.span(CODE), self.problem.config.solver.max_code
@@ -153,20 +155,20 @@ class Views:
         return self.linked(unknowns.retract(alone, to_agreement - step)._replace(code=code))
 
     def linked(self, alone: CarState) -> TrackState:
-        """States (R) with the paths that fit their views best, and poses of next views, where these are unknowns."""
+        """States (R) with the paths that fit best and the poses of next views, where these are unknowns."""
         return _linked(self.problem, self.agreement, self.timed, alone, self.next_view)
 
     def leaving(self, in_track: Refined[TrackState], doubtful: Tensor) -> Tensor:
-        """Views (R,) that leave their track: they fail in it, or are trusted neither alone nor by it.
+        """Mask (R,) of views that leave their track: they fail in it, or are trusted neither alone nor in it.
 
-        Nor is a view trusted on the word of a track in which nobody else is.
+        A view that was not trusted alone also leaves a track in which no other view is trusted.
         """
         status = in_track.minimum.status
         fails = (status == Status.singular.code) | (status == Status.non_finite.code)
         return fails | (doubtful & (~is_refined(status) | (self.part_of(status) < 0)))
 
     def unlike_next(self, in_track: Refined[TrackState]) -> Tensor:
-        """How unlike the next view of their part cars (B,) are; 0 for those that are no such views."""
+        """Unlikeness (B,) of each car and the next view of its part; 0 for cars outside these views."""
         minimum = in_track.minimum
         nothing = torch.zeros(len(self.keep), dtype=minimum.after.cost.dtype, device=self.keep.device)
         term = next((term for term in minimum.stage.terms if isinstance(term, NextView)), None)
@@ -177,7 +179,7 @@ class Views:
         return nothing.index_copy(0, self.rows, unlike)
 
     def part_of(self, status: Tensor) -> Tensor:
-        """The part of its track (R,), -1 for a view that ends with a shape of its own: no other was refined."""
+        """Part (R,) of the track of each view; -1 where no other view of the part was refined to share its shape."""
         is_in = is_refined(status)
         return torch.where(self.agreement.total(is_in.to(torch.float64), is_in) > 1, self.part, -1)
 
@@ -200,21 +202,21 @@ def _photometric(problem: CarProblem) -> PhotometricEvidence | None:
 def in_tracks(
     problem: CarProblem, sharing: Groups, views: CarBatch, alone: CarState, trusted: Tensor, next_view: Tensor
 ) -> CarProblem:
-    """The last stage of a problem of R views: one shape in each group, a path where times are known, each view seen in
-    the next.
+    """Return the last stage of a problem of R views that share a shape in each group.
 
-    `alone` is where they ended by themselves, `trusted` (R,) who is trusted there.
+    The views follow a path where times are known, and each view is seen in the next one. The states `alone` are where
+    the views ended when refined alone; `trusted` (R,) marks the views that are trusted there.
     """
     one = torch.ones_like(sharing.of_problem, dtype=torch.float64)
     factors = one[:, None].expand(-1, len(problem.term_names)) if problem.factors is None else problem.factors
     last = problem.config.stages[-1]
-    # Views that look at each other take more steps to settle.
+    # Views that depend on each other need more iterations to converge.
     last = replace(last, max_iterations=_MORE_ITERATIONS * last.max_iterations)
     config = replace(problem.config, stages=(last,))
     added: list[Evidence] = [*motion_terms(config.tracks, views)]
     columns: list[Tensor] = []
     if added:
-        # A track has one acceleration, whoever its views are.
+        # A track has one acceleration, so its prior is divided among all views.
         hold = hold_of_path(config.tracks, sharing, views, alone, trusted)
         columns = [hold, 1 / sharing.total(one, sharing.everybody)]
     stereo = _photometric(problem)
