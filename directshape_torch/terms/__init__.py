@@ -1,1 +1,1 @@
-"""The summands of the energy: each file has a residual, its Jacobian and its norm."""
+"""This package holds the summands of the energy, with their residuals, Jacobians and norms."""

@@ -1,4 +1,4 @@
-"""Stereo points of each car: the point cloud that the geometric method fits (Engelmann et al., GCPR 2016)."""
+"""This module selects the stereo points of each car, which the geometric method fits (Engelmann et al., GCPR 2016)."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.rows import PointSamples
 from directshape_torch.scene import Detections, FrameBatch
 
-# So many pixels, of some cars, are looked at together; each takes some 200 bytes.
+# About this many pixels are processed at once; each takes about 200 bytes.
 _MOST_PIXELS = 2**20
-# Above the ground plane: lower points are road, higher ones trees.
+# Points of a car have a height above the ground plane in this range: lower points are road, higher ones are trees.
 _HEIGHTS_M = (0.1, 3.0)
-# Of the detection's centre, along the ground: a long car's half and what a detector is wrong by.
+# Points of a car are this close to the detection's centre along the ground: half a long car plus a detector's error.
 _REACH_M = 2.5
 
 
 def car_points(frames: FrameBatch, detections: Detections, config: PointCloudConfig) -> PointSamples:
-    """Points of the left pixels of every car, freed of the rig's bias and filtered by height and distance.
+    """Return the points of the left pixels of every car, without the rig's bias, filtered by height and distance.
 
     Args:
         frames: F frames with disparity.
         detections: B cars with finite or NaN poses; a car without a pose has no points.
-        config: how many points a car has at most.
+        config: largest number of points of a car.
 
     Returns:
         The points, differentiable by the disparity.
@@ -50,7 +50,7 @@ def car_points(frames: FrameBatch, detections: Detections, config: PointCloudCon
 def _points(
     frames: FrameBatch, detections: Detections, disparity: Tensor, pixels: Tensor
 ) -> tuple[Tensor, Tensor]:  # (P,), (P, 3)
-    """The points at pixels (3, P) that may belong to their car: the numbers of the cars, and where the points are."""
+    """The points at pixels (3, P) that may belong to their car: the numbers of the cars and the positions."""
     object_index, v, u = pixels
     known = _known(disparity[detections.frame_index[object_index], v, u]).nonzero()[:, 0]
     object_index, v, u = object_index[known], v[known], u[known]
@@ -70,9 +70,9 @@ def _points(
 
 
 def _pixels(frames: FrameBatch, d: Detections) -> Iterator[Tensor]:
-    """The left pixels of each car, of its mask where it has one, else of its 2D box: car, row and column (3, P).
+    """Yield the left pixels of each car, from its mask if it has one, else from its 2D box: car, row and column (3, P).
 
-    They come in parts that bound the memory, for thousands of boxes without a mask cover an image many times over.
+    The pixels come in parts that bound the memory, because thousands of boxes cover an image many times.
     """
     has_mask, crops, sizes = d.has_mask_left.tolist(), d.mask_left.boxes.tolist(), frames.sizes[d.frame_index].tolist()
     boxes = d.box_2d.detach().double().cpu()
@@ -80,7 +80,7 @@ def _pixels(frames: FrameBatch, d: Detections) -> Iterator[Tensor]:
     corners[boxes.isnan().any(dim=1)] = 0
     part, num_pixels = [d.frame_index.new_zeros(3, 0)], 0
     for car, (height, width) in enumerate(sizes):
-        # Whatever the padding of a smaller frame holds is no part of it.
+        # Pixels in the padding of a smaller frame do not count.
         if has_mask[car]:
             u0, v0 = crops[car][:2]
             pixels = d.mask_left.crop(car)[: max(0, height - v0), : max(0, width - u0)] > MASK_THRESHOLD
@@ -98,19 +98,19 @@ def _pixels(frames: FrameBatch, d: Detections) -> Iterator[Tensor]:
 
 
 def _known(disparity: Tensor) -> Tensor:
-    """Pixels whose disparity is a number; no measurement is written as NaN, zero or less."""
+    """Mask of the measured disparities; an unmeasured one is NaN, infinite, zero or negative."""
     return disparity.isfinite() & (disparity > 0)
 
 
 def stands_at(
     frames: FrameBatch,
     detections: Detections,
-    car: Tensor,  # (*,), that of each point, or what broadcasts to it
+    car: Tensor,  # (*,) car of each point, or a shape that broadcasts to it
     points_cam: Tensor,  # (*, 3)
-    reach_m: Tensor | float,  # of the detection's centre, along the ground
+    reach_m: Tensor | float,  # largest distance from the detection's centre, along the ground
     heights_m: tuple[float, float],
 ) -> Tensor:
-    """Which points (*,) are above the ground and near their car; NaN fails every comparison."""
+    """Mask (*,) of the points that are above the ground and near their car; NaN fails every comparison."""
     frame = detections.frame_index[car]
     normal = frames.ground.normal[frame]
     height = (normal * points_cam).sum(-1) + frames.ground.offset[frame]
@@ -121,7 +121,7 @@ def stands_at(
 
 
 def every_nth(object_index: Tensor, counts: Tensor, most: int) -> Tensor:
-    """Rows of at most `most` points of each object, evenly spread over its pixels in row-major order."""
+    """Row numbers of at most `most` points of each object, evenly spread over its pixels in row-major order."""
     first = torch.cumsum(counts, 0) - counts
     place = torch.arange(len(object_index), device=counts.device) - first[object_index]
     stride = (counts + most - 1) // most

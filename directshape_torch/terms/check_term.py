@@ -1,4 +1,4 @@
-"""A check of terms that users bring, with messages that say which term, what was expected and what came."""
+"""This module checks terms of users; its messages name the term, what was expected and what was given."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from directshape_torch.terms.term import Linear, Sight, Term, Where, linear_of, 
 
 _OWN = ("names", "blocks", "block_weight", "information", "row_weight", "residual", "norm", "of_cars")
 _DEFAULTS = ("sees", "is_prior", "column", "begin", "moving", "where", "linear")
-# Of the largest entry of the matrices and gradients: above what rounding does, below what a centimetre does.
+# Matrices and gradients may differ by this share of their largest entry: by more than rounding, less than 1 cm causes.
 _ROUNDING = 1e-4
 _BLOCKS = POSE, CODE, OFFSET
 _LEAVING = "hand tensors of the cars to PriorTerm(values=...), or cut them in of_cars(keep, numbers)"
 
 
 def check_members(term: Term) -> None:
-    """Raise `InputError` unless a term has what `Term` says, and names for its columns."""
+    """Raise `InputError` unless a term has all members of `Term`, names for its columns and known blocks."""
     missing = [name for name in (*_OWN, *_DEFAULTS) if not _has(term, name)]
     if missing:
         raise InputError(f"extra term {type(term).__name__}", "the members of `Term`", f"none called {missing[0]}")
@@ -45,13 +45,13 @@ def check_members(term: Term) -> None:
 def check_term(
     term: Term, stage: StageConfig, sight: Sight, taken: Collection[str], field_at: Callable[[Tensor], Field]
 ) -> None:
-    """Raise `InputError` unless all that a term gives at a state has the types and shapes that `Term` says.
+    """Raise `InputError` unless all values of a term at a state have the types and shapes that `Term` requires.
 
-    The term is also evaluated as it is when cars have left: the cars that stay must say what they said before.
+    The term is also evaluated after some cars have left: the values of the remaining cars must stay unchanged.
 
     Args:
-        term: of B cars, no stage begun, whose members are there (`check_members`).
-        stage: the first one.
+        term: term of B cars before any stage, with all members (`check_members`).
+        stage: first stage.
         sight: what rays see at any state of these cars.
         taken: names of other terms.
         field_at: the shapes of codes (B, K).
@@ -68,7 +68,7 @@ def check_term(
     _check_linear(f"{called} after moving(...): linear(...)", moving, where, sight.field, sight.state)
     check_shape(f"{called}: the cost of moving(...)", resting, (num_cars, len(names)), "one for each car and name")
     before = car_products(moving, sight.field, sight.state, where)
-    # Every other car, one car, none: in the first two all numbers change.
+    # The remaining cars are every other car, the last car, or none; in the first two cases all cars get new numbers.
     for numbers in dict.fromkeys((tuple(range(1, num_cars, 2)), tuple(range(num_cars))[-1:], ())):
         if len(numbers) < num_cars:
             few = take_rows(sight.state, torch.tensor(numbers, dtype=torch.int64, device=sight.state.code.device))
@@ -78,14 +78,14 @@ def check_term(
 
 
 def car_products(term: Term, field: Field, state: State, where: Where) -> Tensor:
-    """What a term adds to the systems of its cars (B, D + 1, D): the Gauss-Newton matrix, the gradient below it."""
+    """Sums of a term for its cars (B, D + 1, D): the Gauss-Newton matrix, and the gradient as its last row."""
     products = part_of(term, linear_of(term, field, state, where), fisher=False).products
     sums = products.new_zeros(len(state.code), *products.shape[1:])
     return sums.index_add(0, term.blocks.owner, products * term.block_weight[:, None, None])
 
 
 def check_same(called: str, now: Tensor, before: Tensor, numbers: Sequence[int]) -> None:
-    """Raise `InputError` unless cars, `numbers` of all, add to their systems (B, D + 1, D) what they added before."""
+    """Raise `InputError` unless the sums `now` of the cars `numbers` equal their rows of `before` (B, D + 1, D)."""
     if not numbers:
         return
     expected = before[list(numbers)]
@@ -99,7 +99,7 @@ def check_same(called: str, now: Tensor, before: Tensor, numbers: Sequence[int])
 def _check_leaving(
     called: str, term: Term, where: Where, few: State, field: Field, numbers: Sequence[int], num_cars: int
 ) -> Tensor:
-    """What a few cars, `numbers` of all, add to their systems as an iteration asks for it when the others have left."""
+    """Sums of the cars `numbers`, computed and checked as in an iteration after the other cars have left."""
     keep = torch.zeros(num_cars, dtype=torch.bool, device=few.code.device)
     keep[list(numbers)] = True
     with named_errors(called, len(numbers)):
@@ -115,7 +115,7 @@ def _check_leaving(
 
 @contextmanager
 def named_errors(called: str, num_cars: int, cure: str = _LEAVING) -> Iterator[None]:
-    """Name the term in errors of a user's own code: tensors of other cars do not fit the rows of these."""
+    """Name the term in errors of a user's code, which arise where tensors do not fit the number of cars."""
     try:
         yield
     except InputError:
@@ -125,14 +125,14 @@ def named_errors(called: str, num_cars: int, cure: str = _LEAVING) -> Iterator[N
 
 
 def _has(term: Term, name: str) -> bool:
-    """Whether it has a member, and not only the empty one that a subclass of `Term` inherits."""
-    # Not `hasattr`: rows may be known only when a stage has begun.
+    """Whether a term has a member that is more than an empty member inherited from `Term`."""
+    # `hasattr` would evaluate properties, and rows may be known only after a stage has begun.
     is_inherited = name in _OWN and inspect.getattr_static(term, name, None) is vars(Term)[name]
     return name in dir(term) and not is_inherited
 
 
 def _check_rows(called: str, term: Term, num_cars: int) -> None:
-    """Blocks of the cars in this batch, and one weight for each block and row."""
+    """Check that the blocks belong to cars of this batch, and that each block and row has one weight."""
     blocks = term.blocks
     if not isinstance(blocks, Blocks):
         raise InputError(f"{called}: blocks", "a Blocks", type(blocks).__name__)
@@ -166,7 +166,7 @@ def _check_numbers(called: str, numbers: Tensor, count: int, of_what: str) -> No
 
 
 def _check_linear(called: str, term: Term, where: Where, field: Field, state: State) -> None:
-    """Factors of the Jacobian that fit the rows, and residuals and norms that fit them."""
+    """Check that the factors of the Jacobian, the residuals and the norms fit the rows."""
     with named_errors(called, len(state.code)):
         at = term.linear(field, state, where)
     if not isinstance(at, Linear):

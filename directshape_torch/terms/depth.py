@@ -1,9 +1,9 @@
-"""Where rays look: the point at which each comes closest to its car, and the surface that it meets first.
+"""This module finds the point at which each ray comes closest to its car, and the surface that it meets first.
 
-A depth is found in one of two ways. Where nothing is known a ray is marched: sampled inside the prior's bounds, the
-best sample improved. Where a state nearby is known it is tracked: the point at which it looked then, carried along in
-the car's frame, is improved. Both end at the same point, and depths are constants of a linearisation; `attached_*` give
-them the derivatives that a linearisation needs to be differentiated itself.
+A depth is found in one of two ways. Where nothing is known, a ray is marched: it is sampled inside the prior's bounds,
+and the best sample is improved. Where a nearby state is known, the ray is tracked: its point at that state moves with
+the car's frame and is improved. Both ways end at one point. Depths are constants of a linearisation;
+`attached_closest_depth` and `surface_depth` give them derivatives, so that a linearisation can be differentiated.
 """
 
 from __future__ import annotations
@@ -18,63 +18,64 @@ from directshape_torch.numerics.gradient_mode import as_constant
 from directshape_torch.rows import ObjectRays, Rays
 from directshape_torch.shape.field import Field
 
-# Cells looked into for the least distance, from where a parabola through samples has it. Of the rays near a contour one
-# in a thousand is then more than 1 mm from its minimum; of tracked ones 5 % while a car still moves by decimetres.
+# The search for the least distance visits this many cells, from the vertex of a parabola through samples. One in a
+# thousand of the rays near a contour is then more than 1 mm from its minimum; 5 % of the tracked rays are while a car
+# still moves by decimetres.
 _CELLS_OF_MARCH = 3
 _CELLS_WHEN_TRACKED = 2
-# Between the three samples about a point that is tracked.
+# The three samples about a tracked point have this distance.
 _SAMPLE_M = 0.2
-# In distances of samples: about a cell.
+# A minimum further away than this, in sample distances, lies in another cell; this is about the size of a cell.
 _NEXT_CELL = 0.5
-# Second difference of samples below which their parabola is rounding.
+# A smaller second difference of samples is only rounding, so their parabola is meaningless.
 _LEAST_SECOND_DIFFERENCE_M = 1e-6
-# Within the prior's bounds, where the field has a kink and no derivative.
+# Depths stay this far inside the prior's bounds, where the field has a kink and no derivative.
 _MARGIN_M = 1e-4
-# A depth so near to an end of its interval is there.
+# A depth this near to an end of its interval counts as the end.
 _AT_END_M = 1e-5
-# False position, superlinear from a bracket of one sample distance: 8 reach float32's precision. With 5 the surface is
-# off by up to a millimetre, and so is the slope of what is differentiated: gradients of refinements by half a percent.
+# False position converges superlinearly from a bracket of one sample distance; 8 probes reach float32's precision. With
+# 5 probes the surface is wrong by up to a millimetre and gradients of refinements by half a percent.
 _PROBES = 8
-# Points of a march that are looked up at once on a processor: 400 kB of coordinates stay in its caches.
+# A march on a CPU looks up this many points at once, so that 400 kB of coordinates stay in its caches.
 _POINTS_AT_ONCE = 32_768
-# A tracked depth moves by no more than this between its tangent plane's word and the surface.
+# One step moves a tracked depth by at most this much.
 _MAX_STEP_M = 0.3
-# Secants of a tracked depth, beside the Newton step that comes with the derivatives.
+# A tracked depth takes this many secant steps before the Newton step that comes with the derivatives.
 _SECANTS = 1
-# Signed distance at which a Newton step lands on the surface to a fraction of a millimetre.
+# From this signed distance a Newton step reaches the surface to a fraction of a millimetre.
 NEAR_SURFACE_M = 0.03
-# Of a step along the ray whose ends tell a slope.
+# The ends of a step along the ray give a slope if the step is longer than this.
 _LEAST_STEP_M = 1e-3
-# Of the slope at the hit that the slope of a secant must have at least.
+# The slope of a secant must have at least this share of the slope at the hit.
 _FLATTEST_SHARE = 0.2
-# Below this slope along the ray, per metre of depth, a tangent plane is no guide, and a depth has no derivative.
+# Below this slope along the ray, per metre of depth, a tangent plane gives no useful depth and no derivative.
 _LEAST_SLOPE = 1e-3
-# Per metre: below it a minimum along the ray is so flat that where it moves means nothing.
+# Below this curvature, per metre, a minimum along the ray is so flat that its motion is meaningless.
 _LEAST_CURVATURE = 1e-6
-# Beyond every car that is ever seen: where a ray starts that met no surface.
+# A ray without a surface gets points at this coordinate, beyond every visible car.
 _FAR_M = 1e4
 
 
 class Closest(NamedTuple):
-    """Where rays (M, R) come closest to their car."""
+    """`Closest` holds the points where rays (M, R) come closest to their car."""
 
     points_obj: Tensor  # (3, M, R) metres
     depth: Tensor  # (M, R) metres
-    crosses: Tensor  # (M, R) bool: the ray crosses the prior's bounds; if not the rest means nothing
+    crosses: Tensor  # (M, R) bool, whether the ray crosses the prior's bounds; other fields are valid only there
     face_obj: Tensor  # (3, M, R) see `RayMinimum`
 
 
 class Hits(NamedTuple):
-    """Where rays (M, R) enter their car."""
+    """`Hits` holds the points where rays (M, R) enter their car."""
 
     points_obj: Tensor  # (3, M, R) metres, far away where no ray enters
-    normal_obj: Tensor  # (3, M, R) gradient of the signed distance there
-    found: Tensor  # (M, R) bool
+    normal_obj: Tensor  # (3, M, R) gradient of the signed distance at the points
+    found: Tensor  # (M, R) bool, whether the ray enters
     depth: Tensor  # (M, R) metres
 
 
 class March(NamedTuple):
-    """Signed distances at S samples of rays (M, R)."""
+    """A `March` holds the signed distances at S samples of rays (M, R)."""
 
     depths: Tensor  # (S, M, R) metres, ascending
     sdf: Tensor  # (S, M, R) metres
@@ -85,7 +86,7 @@ class March(NamedTuple):
 def marched_views(
     left: Rays, right: Rays, bounds_obj: Tensor, num_samples: int, field: Field, T_obj_cam: Tensor
 ) -> tuple[Closest, Hits]:
-    """Where the rays of both images come closest, left ones first, and where those of the left one enter: constants."""
+    """Closest points of the rays of both images, left first, and hits of the left rays; all are constants."""
     pairs = zip(left, right, (0, 0, 1), strict=True)
     both = Rays(*(torch.cat([x, y], dim=axis) for x, y, axis in pairs))
     rays, num_left = both.in_objects(T_obj_cam), len(left.owner)
@@ -113,7 +114,7 @@ def march(field: Field, owner: Tensor, rays: ObjectRays, bounds_obj: Tensor, num
 
 
 def sample_depths(rays: ObjectRays, bounds_obj: Tensor, num_samples: int) -> tuple[Tensor, Tensor]:
-    """The depths (S, M, R) of a march, ascending, and which rays (M, R) cross the bounds; differentiable."""
+    """Differentiable depths (S, M, R) of a march, ascending, and a mask (M, R) of the rays that cross the bounds."""
     inside = rays.interval(bounds_obj)
     share = (torch.arange(num_samples, dtype=inside.near.dtype, device=inside.near.device) + 0.5) / num_samples
     return inside.near + (inside.far - inside.near) * share[:, None, None], inside.hit
@@ -132,27 +133,27 @@ def closest_of_march(field: Field, owner: Tensor, rays: ObjectRays, bounds_obj: 
     step = depths[1] - depths[0] if count > 1 else torch.zeros_like(here)
     start = depths.gather(0, best)[0] + torch.where(is_inner, _vertex(before, here, after, 0.5), 0.0) * step
     closest = _closest_from(field, owner, rays, bounds_obj, start, _CELLS_OF_MARCH)
-    # A ray that misses the bounds has no closest point yet; should it come in, it will come by the middle.
+    # A ray outside the bounds has no closest point yet; tracking it starts next to the middle of the bounds.
     by_the_middle = rays.at(rays.depth_next_to(bounds_obj.mean(dim=0).view(3, 1, 1).expand_as(rays.direction_obj)))
     return closest._replace(points_obj=torch.where(closest.crosses, closest.points_obj, by_the_middle))
 
 
 @as_constant
 def tracked_closest(field: Field, rays: Rays, in_objects: ObjectRays, bounds_obj: Tensor, before: Closest) -> Closest:
-    """The point of closest approach next to where a ray was closest at a state nearby."""
+    """The point of closest approach of every ray, near its closest point at a nearby state."""
     next_to = in_objects.depth_next_to(before.points_obj)
     samples = torch.stack([next_to - _SAMPLE_M, next_to, next_to + _SAMPLE_M])
     sdf = field.value(in_objects.at(samples), rays.owner, inside=True)
     vertex = _vertex(sdf[0], sdf[1], sdf[2], 1.0)
-    # A minimum in the next cell is found from here, and one that is here stays the one that is looked at.
+    # The start moves only to a minimum in another cell, so that a nearby minimum remains the selected one.
     start = torch.add(next_to, vertex * (vertex.abs() > _NEXT_CELL), alpha=_SAMPLE_M)
     now = _closest_from(field, rays.owner, in_objects, bounds_obj, start, _CELLS_WHEN_TRACKED)
-    # A ray that misses the bounds goes on from where it was last.
+    # A ray that misses the bounds keeps its last point.
     return now._replace(points_obj=torch.where(now.crosses, now.points_obj, before.points_obj))
 
 
 def _vertex(before: Tensor, here: Tensor, after: Tensor, reach: float) -> Tensor:
-    """Where the parabola through three samples is least, in their distances; at the lower end without a valley."""
+    """Minimum of the parabola through three samples, in sample distances; without a valley, the lower end."""
     curvature = (before - 2 * here + after).clamp_min(_LEAST_SECOND_DIFFERENCE_M)
     return (0.5 * (before - after) / curvature).clamp(-reach, reach)
 
@@ -165,9 +166,9 @@ def _closest_from(
     far = torch.where(inside.hit, inside.far, inside.near)
     start = torch.minimum(torch.maximum(start, inside.near), far)
     found = field.minimum_along(owner, rays.centre_obj, rays.direction_obj, start, inside.near, far, max_cells)
-    # At an end of the interval the point slides along the plane through which the ray comes or goes.
-    # Weights of 0 and 1 choose (others only where a ray misses, whose face nobody asks for): a choice by a condition
-    # costs as much as ten sums.
+    # At an end of the interval the point slides along the plane through which the ray enters or leaves. Weights of 0
+    # and 1 select the face, because a choice by a condition costs as much as ten sums. Other weights occur only where a
+    # ray misses, and the face of a miss is unused.
     comes, goes = 1 - (inside.near - inside.enters).sign(), 1 - (inside.leaves - inside.far).sign()
     face = torch.lerp(found.face_obj, comes, (found.depth <= inside.near + _AT_END_M).to(start.dtype))
     face = torch.lerp(face, goes, (found.depth >= inside.far - _AT_END_M).to(start.dtype))
@@ -175,10 +176,10 @@ def _closest_from(
 
 
 def along_face(gradient: Tensor, direction_obj: Tensor, face_obj: Tensor) -> Tensor:
-    """The gradient (3, M, R) of the least distance along a ray by the point where it is taken.
+    """Return the gradient (3, M, R) of the least distance along a ray by the closest point.
 
-    On a face with normal n the minimum is a kink, and the closest point stays on the face: `g - n (g . d) / (n . d)`.
-    Where the minimum is smooth the gradient is orthogonal to the ray already.
+    On a face with normal n the minimum is a kink and the closest point stays on the face, so the gradient is
+    `g - n (g . d) / (n . d)`. At a smooth minimum the gradient g is already orthogonal to the ray.
     """
     across = (face_obj * direction_obj).sum(0)
     is_kink = across != 0
@@ -187,9 +188,9 @@ def along_face(gradient: Tensor, direction_obj: Tensor, face_obj: Tensor) -> Ten
 
 
 def attached_closest_depth(field: Field, owner: Tensor, rays: ObjectRays, closest: Closest) -> Tensor:
-    """The depth (M, R) of closest approach with its first derivatives by rays and shape; the value is unchanged.
+    """Attach to the depth (M, R) of closest approach its first derivatives by rays and shape; the value is unchanged.
 
-    At a smooth minimum the slope along the ray stays zero, at a kink the point stays on its face.
+    At a smooth minimum the slope along the ray stays zero; at a kink the point stays on its face.
     """
     points = rays.at(closest.depth)
     direction, face = rays.direction_obj, closest.face_obj
@@ -208,9 +209,9 @@ def attached_closest_depth(field: Field, owner: Tensor, rays: ObjectRays, closes
 
 @as_constant
 def first_hits(field: Field, owner: Tensor, rays: ObjectRays, marched: March, closest: Closest) -> Hits:
-    """Where rays first enter their car, by bracketing and false position (`Bracket`).
+    """Find where rays first enter their car, by bracketing and false position (`Bracket`).
 
-    The point of closest approach counts as a sample too, so that thin parts between two samples are not missed.
+    The point of closest approach counts as a sample too, so that thin parts between two samples are found.
     """
     closest_sdf = field.value(rays.at(closest.depth), owner, inside=True)
     bracket, found = _first_bracket(marched, closest.depth, closest_sdf)
@@ -223,9 +224,9 @@ def first_hits(field: Field, owner: Tensor, rays: ObjectRays, marched: March, cl
 
 
 def _first_bracket(marched: March, closest_depth: Tensor, closest_sdf: Tensor) -> tuple[Bracket, Tensor]:
-    """The first pair of neighbouring samples, the closest approach among them, outside and inside; if any (M, R).
+    """Return the first pair of neighbouring samples of which one is outside and the next inside, and where it exists.
 
-    Rays that stay outside have an idle bracket about their closest approach.
+    The closest approach counts as a sample. Rays that stay outside have an empty bracket at their closest approach.
     """
     depths, sdf, crosses = marched
     inside = sdf < 0
@@ -235,7 +236,7 @@ def _first_bracket(marched: March, closest_depth: Tensor, closest_sdf: Tensor) -
     behind = torch.where(is_closest, closest_depth, behind)
     behind_sdf = torch.where(is_closest, closest_sdf, behind_sdf)
     enters = crosses & (is_inside | is_closest)
-    # A ray whose first sample is inside enters through the border of the grid: there is no surface to see.
+    # A ray whose first sample is inside enters through the border of the grid, where no surface is visible.
     last = (depths < behind).sum(dim=0, keepdim=True) - 1
     before, before_sdf = (x.gather(0, last.clamp_min(0))[0] for x in (depths, sdf))
     is_outside = last[0] >= 0
@@ -250,10 +251,10 @@ def _first_bracket(marched: March, closest_depth: Tensor, closest_sdf: Tensor) -
 
 @as_constant
 def tracked_depth(field: Field, rays: Rays, in_objects: ObjectRays, before: Hits) -> Tensor:
-    """Depth (M, R) next to the surface, within a Newton step of it, near the hits of a state nearby.
+    """Return a depth (M, R) within a Newton step of the surface, near the hits of a nearby state.
 
-    The hit's tangent plane, carried along in the car's frame, gives a first depth; secant steps improve it. Where
-    that leads to no surface the depth means nothing, which the signed distance there tells.
+    The tangent plane of the hit, which moves with the car's frame, gives a first depth; secant steps improve it. Where
+    they find no surface, the depth is meaningless, which a large signed distance at this depth shows.
     """
     slope = (before.normal_obj * in_objects.direction_obj).sum(0)
     slope = torch.where(slope.abs() > _LEAST_SLOPE, slope, torch.full_like(slope, -_LEAST_SLOPE))
@@ -261,7 +262,7 @@ def tracked_depth(field: Field, rays: Rays, in_objects: ObjectRays, before: Hits
     next_to = in_objects.depth_next_to(before.points_obj)
     depth = next_to + (to_plane - next_to).clamp(-_MAX_STEP_M, _MAX_STEP_M)
     sdf = field.value(in_objects.at(depth), rays.owner, inside=True)
-    # The old slope was that of another point: after a long step of the car only further secants reach the surface.
+    # The old slope belongs to another point, so after a long step of the car further secants are needed.
     for _ in range(_SECANTS):
         step = -(sdf / slope).clamp(-_MAX_STEP_M, _MAX_STEP_M)
         depth = depth + step
@@ -271,20 +272,20 @@ def tracked_depth(field: Field, rays: Rays, in_objects: ObjectRays, before: Hits
 
 
 def _secant_slope(step: Tensor, sdf_before: Tensor, sdf: Tensor, slope: Tensor) -> Tensor:
-    """Slope along the ray (M, R) between the last two points; the one at hand where they tell none."""
-    # On both sides of the surface points tell it however near they are. Where the slope jumps there, at the face of a
-    # cell, the one at hand would lead back to the point before, again and again.
+    """Slope along the ray (M, R) between the last two points; the given slope where they determine none."""
+    # Two points on opposite sides of the surface determine a slope at any distance. Where the slope jumps at the face
+    # of a cell, the given slope would lead back to the previous point again and again.
     tells = (step.abs() > _LEAST_STEP_M) | (sdf * sdf_before < 0)
     secant = (sdf - sdf_before) / torch.where(tells, step, torch.ones_like(step))
-    # Entering, and not so flat that the next step would be a leap.
+    # The secant must enter the shape and be steep enough to avoid a huge next step.
     return torch.where(tells & (secant < _FLATTEST_SHARE * slope) & (slope < 0), secant, slope)
 
 
 def surface_depth(field: Field, owner: Tensor, rays: ObjectRays, depth: Tensor, usable: Tensor) -> Tensor:
-    """The depth (M, R) of the surface as a differentiable function of rays and shape, by two Newton steps.
+    """Return the depth (M, R) of the surface as a differentiable function of rays and shape, by two Newton steps.
 
-    From a depth on the surface or next to it, a constant, which is returned where none is `usable`. One step has the
-    right first derivative but a wrong second one.
+    The steps start at the constant `depth` on the surface or near it, which is returned where `usable` is false. A
+    single step would have the right first derivative but a wrong second one.
     """
     for _ in range(2):
         at = field.derivatives(rays.at(depth), owner)
@@ -296,31 +297,31 @@ def surface_depth(field: Field, owner: Tensor, rays: ObjectRays, depth: Tensor, 
 
 
 class Bracket(NamedTuple):
-    """Depths of rays (...) between which each enters a shape, one end outside and one inside."""
+    """A `Bracket` holds two depths of each ray (...), one outside and one inside the shape that the ray enters."""
 
-    depth: Tensor  # (...) to probe next
+    depth: Tensor  # (...) depth of the next probe
     latest: Tensor  # (...) the end that was probed last
-    latest_sdf: Tensor  # (...) signed distance there
-    latest_inside: Tensor  # (...) bool
+    latest_sdf: Tensor  # (...) signed distance at the latest end
+    latest_inside: Tensor  # (...) bool, whether the latest end is inside
     other: Tensor  # (...) the other end
-    other_sdf: Tensor  # (...) signed distance there, less where it has stayed
+    other_sdf: Tensor  # (...) signed distance at the other end, reduced where this end has stayed
     best: Tensor  # (...) the depth of the least absolute distance so far
-    best_distance: Tensor  # (...)
+    best_distance: Tensor  # (...) the least absolute distance so far
 
     @classmethod
     def between(cls, before: Tensor, before_sdf: Tensor, behind: Tensor, behind_sdf: Tensor) -> Bracket:
-        """A new one, of depths outside and inside."""
+        """A new bracket from depths outside and inside."""
         inside = torch.ones_like(behind_sdf, dtype=torch.bool)
         depth = _line_zero(before, before_sdf, behind, behind_sdf)
         return cls(depth, behind, behind_sdf, inside, before, before_sdf, behind, behind_sdf.abs())
 
     def probed(self, sdf: Tensor) -> Bracket:
-        """With one end moved to `depth`, of signed distance (...): false position by nearly Illinois' rule."""
+        """The bracket with one end moved to `depth`, whose signed distance is `sdf` (...), by false position."""
         inside = sdf < 0
         crossed = inside ^ self.latest_inside
         other = torch.where(crossed, self.latest, self.other)
-        # Halving the value of an end that stays makes the convergence superlinear. Illinois' rule begins with the
-        # second probe; from the first one on it takes fewer operations, and eight probes come as near.
+        # Halving the value of a fixed end makes the convergence superlinear. Illinois' rule starts with the second
+        # probe; halving from the first takes fewer operations, and eight probes are as accurate.
         other_sdf = torch.where(crossed, self.latest_sdf, 0.5 * self.other_sdf)
         distance = sdf.abs()
         best = torch.where(distance < self.best_distance, self.depth, self.best)
@@ -330,5 +331,5 @@ class Bracket(NamedTuple):
 
 
 def _line_zero(depth: Tensor, sdf: Tensor, other: Tensor, other_sdf: Tensor) -> Tensor:
-    # One of them is not negative and the other is, so the share is in [0, 1].
+    # Exactly one of the two distances is negative, so the share is in [0, 1].
     return torch.lerp(depth, other, sdf / (sdf - other_sdf))

@@ -1,4 +1,4 @@
-"""A term that has residuals alone: its Jacobian comes from automatic differentiation, as slow as that is."""
+"""This module gives a Jacobian, by slow automatic differentiation, to a term that has only residuals."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from directshape_torch.terms.term import Linear, Sight, Term, Where, by_autograd
 
 
 def with_jacobian(term: Term, prior: ShapePrior) -> Term:
-    """The term itself where it has a `linear` of its own, else one that differentiates its `residual`."""
+    """The term itself if it has its own `linear`, else a term that differentiates its `residual`."""
     return Derived(term, prior) if inspect.getattr_static(term, "linear") is vars(Term)["linear"] else term
 
 
 @dataclass(frozen=True)
 class Derived(Term):
-    """A term without `linear`, whose rows have one residual each."""
+    """A `Derived` gives `linear` to a term that lacks it and whose rows have one residual each."""
 
     term: Term
-    prior: ShapePrior  # whose shapes the field of a moved state is made of
+    prior: ShapePrior  # shape prior from which the field of a moved state is made
 
     @property
     def names(self) -> tuple[str, ...]:

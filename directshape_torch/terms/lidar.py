@@ -1,4 +1,4 @@
-"""LiDAR points as evidence: each car's own of `FrameBatch.points_cam`, on its surface (docs/extra_terms.md)."""
+"""This module makes a term of the LiDAR points of `FrameBatch.points_cam` on each car (docs/extra_terms.md)."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from directshape_torch.state.cars import CarBatch
 from directshape_torch.terms.car_points import every_nth, stands_at
 from directshape_torch.terms.point_cloud import PointCloud
 
-# A detector's error in place, beyond which a point belongs to something else.
+# Points further than this outside the box, more than a detector's position error, belong to something else.
 _BEYOND_BOX_M = 1.0
-# Above the ground plane, whose own error is 0.05 m: lower points are road.
+# Points of a car have heights in this range above the ground plane, whose error is 0.05 m: lower points are road.
 _HEIGHTS_M = (0.15, 3.0)
-# Fewer may all be of a pole or of a car behind, and would weigh as much as hundreds.
+# Fewer points than this may all be of a pole or of a car behind, and would weigh as much as hundreds.
 _LEAST_POINTS = 10
 _MOST_POINTS = 1000
 
 
 @dataclass(frozen=True)
 class LidarPoints:
-    """Makes the term "lidar" of the points that the frames bring: a `TermFactory`.
+    """This `TermFactory` makes the term "lidar" of the points that the frames bring.
 
-    A point says where the surface is to about 4 cm: 2 to 3 cm of the scanner's noise, and as much again by which a
+    A point gives the position of the surface to about 4 cm: 2 to 3 cm of noise of the scanner, and 2 to 3 cm by which a
     shape of a few codes in cells of 0.1 m differs from a real car. The second part is common to the points of a panel,
     so all points of a car count as one sure measurement, in the units of the priors (half a squared standard deviation,
-    at weight 0.5): `0.5 / 0.04^2 = 300` per square metre. What is further off than a cell is no surface that the shape
-    can follow (mirrors, seats behind glass) and pulls with a constant force.
+    at weight 0.5): `0.5 / 0.04^2 = 300` per square metre. A point further away than a cell (a mirror, a seat behind
+    glass) is no surface that the shape can follow, and it pulls with a constant force.
 
     Attributes:
         weight: of the mean over the points of a car, per square metre.
@@ -56,10 +56,10 @@ class LidarPoints:
 
 
 def lidar_points(frames: FrameBatch, detections: Detections, rows: Tensor) -> PointSamples:
-    """The points of each of some detections, `rows` (B,) of them.
+    """Return the points of the detections in `rows` (B,).
 
-    A point is a car's that falls into its left mask (into its 2D box where it has none), stands above the ground and
-    lies no further from the middle of the box, along the ground, than the box reaches and a detector errs.
+    A point belongs to a car if it falls into the left mask (the 2D box where there is no mask), is above the ground,
+    and is no further from the middle of the box along the ground than half the box's diagonal plus a detector's error.
 
     Raises:
         InputError: the frames bring no points.
@@ -79,7 +79,7 @@ def lidar_points(frames: FrameBatch, detections: Detections, rows: Tensor) -> Po
 
 
 def _in_mask(frames: FrameBatch, detections: Detections, rows: Tensor, points_cam: Tensor) -> Tensor:
-    """Which points (B, P) the left camera sees in the mask, or the 2D box, of their car; NaN fails every comparison."""
+    """Mask (B, P) of points that the left camera sees in the mask, or 2D box, of their car; false for NaN."""
     frame = detections.frame_index[rows]
     uv = project(points_cam, frames.camera.K_left[frame][:, None])
     height, width = frames.sizes[frame, :, None].unbind(1)

@@ -1,11 +1,11 @@
-"""Photometry: the left image warped to the right one through the surface of each car (paper, E_photo and r_photo).
+"""This term warps the left image to the right one through the surface of each car (paper, E_photo and r_photo).
 
-`1 / (|Omega'| N) sum_p sum_p~ w_p ||I_r(warp(p~, d_p)) - I_l(p~)||`: all N neighbours of a pixel are warped with the
-depth d_p of the surface under it, so all its residuals see the state through that one depth, whose derivative is
-exact: `d depth / d sdf = -1 / (grad . ray)` (the paper's `-1 / cos(theta)` assumes |grad| = 1 and depth along the
-ray). Where the rig's disparity is off by an unknown offset, the depth of the warp is the one that it feigns. Within a
-stage the pixel set is fixed: a pixel that loses its surface, leaves the right image, grazes the surface or comes to lie
-under a nearer car pays a constant with zero Jacobian instead of vanishing from the mean. Derivation:
+The cost is `1 / (|Omega'| N) sum_p sum_p~ w_p ||I_r(warp(p~, d_p)) - I_l(p~)||`. All N neighbours of a pixel are warped
+with the depth d_p of the surface under the pixel, so all residuals of the pixel depend on the state through this depth.
+Its derivative is exact: `d depth / d sdf = -1 / (grad . ray)` (the paper's `-1 / cos(theta)` assumes |grad| = 1 and
+depth along the ray). Where the rig's disparity has an unknown offset, the warp uses the depth of the shifted disparity.
+Within a stage the pixel set is fixed: a pixel that loses its surface, leaves the right image, grazes the surface or is
+hidden by a nearer car costs a constant with zero Jacobian and remains in the mean. The derivation is in
 docs/derivations/photometric.md.
 """
 
@@ -40,45 +40,45 @@ from directshape_torch.terms.term import Linear, Sight, Term
 
 Brightness = Literal["none", "gain", "affine"]
 
-# Two exposures differ by a few percent; more is a wrong pose.
+# Two exposures differ by a few percent; a larger gain comes from a wrong pose.
 _GAIN_BOUNDS = (0.8, 1.25)
-# Contrast in grey levels that a car has at least: noise on an even one says nothing of the gain.
+# A car counts with at least this contrast, in grey levels, because noise on an even car does not determine the gain.
 _LEAST_CONTRAST = 5.0
-# Of a ray and the normal of the surface that it meets: below it is grazing and lost.
+# A ray grazes the surface, and is lost, if the cosine of its angle with the normal is smaller.
 _LEAST_RAY_COSINE = 0.1
-# Of a disparity, that an offset must leave of it: beyond infinity nothing is seen.
+# An offset must leave at least this share of a disparity, because points beyond infinity are invisible.
 _LEAST_SHARE = 1e-3
 
 
 class PixelSet(NamedTuple):
-    """The pixels of a stage."""
+    """A `PixelSet` holds the pixels of a stage."""
 
     rows: PhotometricRows
     blocks: Blocks
-    sight_blocks: Blocks  # of a `Sight` of the same cars, in the left image
-    sight_place: Tensor  # (M, 64) place of each pixel in these blocks
-    filled: Tensor  # (M, 64) bool
+    sight_blocks: Blocks  # blocks of a `Sight` of these cars, in the left image
+    sight_place: Tensor  # (M, 64) place of each pixel in `sight_blocks`
+    filled: Tensor  # (M, 64) bool, whether the place holds a pixel
     weight: Tensor  # (M,) float64, lambda over the number of neighbours of the car
-    support: Tensor  # (B,) pixels of the car, float64
+    support: Tensor  # (B,) number of pixels of the car, float64
 
 
 class Surface(NamedTuple):
-    """The surface under the pixels: where the rows of this term look."""
+    """A `Surface` is where the rows of this term look: the surface under the pixels."""
 
     points_obj: Tensor  # (3, M, 64) metres, next to the surface
-    normal_obj: Tensor  # (3, M, 64) gradient of the signed distance there
-    depth: Tensor  # (M, 64) with which the pixels are warped, metres
-    on_surface: Tensor  # (M, 64) bool: there is one, and it is not grazing
-    usable: Tensor  # (M, 64) bool: and it can be compared with the right image
+    normal_obj: Tensor  # (3, M, 64) gradient of the signed distance at `points_obj`
+    depth: Tensor  # (M, 64) depth with which the pixels are warped, metres
+    on_surface: Tensor  # (M, 64) bool, whether the ray meets a surface without grazing it
+    usable: Tensor  # (M, 64) bool, whether the pixel is on the surface and comparable with the right image
 
 
 @dataclass(frozen=True)
 class PhotometricEvidence:
-    """What the images show of B cars, of which the photometric term of each stage is made: an `Evidence`."""
+    """This `Evidence` is what the images show of B cars; each stage makes its photometric term of it."""
 
     config: PhotometricConfig  # weight and forms
     cars: CarBatch  # B cars
-    left: LeftPixels  # what pixel sets are made of
+    left: LeftPixels  # pixels from which pixel sets are made
 
     names = ("photometric",)
 
@@ -96,7 +96,7 @@ class PhotometricEvidence:
         rows = left.rows(self.config, self.cars, packed, row, stage.image_level)
         depth = sight.hits.depth.flatten()[place]
         if not nothing_is_differentiated():
-            # The brightness follows the surface.
+            # The matched brightness depends on the surface and must be differentiable by it.
             rays = rows.rays.in_objects(sight.state.T_obj_cam)
             depth = surface_depth(sight.field, packed.blocks.owner, rays, depth, packed.filled)
         warped = warped_pixels(rows, warped_depth(self.cars, depth, sight.state, packed.blocks.owner)[0])
@@ -118,7 +118,7 @@ class PhotometricEvidence:
 
 @dataclass(frozen=True)
 class Photometric(Term):
-    """The term of a stage that has begun; see module."""
+    """A `Photometric` is the term of a stage that has begun; the docstring of the module gives its cost."""
 
     config: PhotometricConfig  # weight and forms
     cars: CarBatch  # B cars
@@ -137,7 +137,7 @@ class Photometric(Term):
 
     @property
     def information(self) -> Tensor:
-        """The neighbourhoods of neighbouring samples overlap: a pixel counts once, with its neighbourhood's mean."""
+        """The neighbourhoods of pixels overlap, so each pixel counts once, with the mean of its neighbourhood."""
         per_pixel = self.pixel_set.support / self.config.huber_grey_levels**2 / self.config.weight
         return self.block_weight * per_pixel[self.blocks.owner]
 
@@ -182,7 +182,7 @@ class Photometric(Term):
         blocks, kept = fixed.blocks.of_cars(keep, numbers)
         place, filled, weight = (x.index_select(0, kept) for x in (fixed.sight_place, fixed.filled, fixed.weight))
         index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
-        # A later `Sight` has the blocks of these cars alone.
+        # A later `Sight` has only the blocks of the remaining cars.
         new_block = torch.cumsum(keep[fixed.sight_blocks.owner].long(), 0) - 1
         place = new_block[place // BLOCK] * BLOCK + place % BLOCK
         sight_blocks, _ = fixed.sight_blocks.of_cars(keep, numbers)
@@ -192,30 +192,30 @@ class Photometric(Term):
 
 
 def warped_depth(cars: CarBatch, depth: Tensor, state: State, owner: Tensor) -> tuple[Tensor, Tensor | None]:
-    """The depth (M, 64) with which pixels are warped whose surface has a depth (M, 64), and surface over warp.
+    """Return the depth (M, 64) that warps pixels whose surface has `depth` (M, 64), and the ratio of `depth` to it.
 
-    `1 / warp = 1 / depth + offset / (f B)`; without an unknown offset it is the surface's, and there is no ratio.
+    `1 / warp = 1 / depth + offset / (f B)`. Without an unknown offset both depths are equal, and the ratio is None.
     """
     if not state.offset_px.shape[1]:
         return depth, None
     ratio = 1 + depth * cars.inverse_depth_of_offset(state.offset_px)[owner]
-    # What has no disparity left goes behind the camera, where it is lost.
+    # A point whose disparity would vanish is moved behind the camera, where it is lost.
     ratio = torch.where(ratio > _LEAST_SHARE, ratio, -1.0)
     return depth / ratio, ratio
 
 
 class NearSurface(NamedTuple):
-    """The surface under pixels, within a Newton step of where they looked before."""
+    """`NearSurface` is the surface under pixels, one Newton step from `points_obj`."""
 
     rays: ObjectRays
-    points_obj: Tensor  # (3, M, 64) metres, from which the step was taken
-    normal_obj: Tensor  # (3, M, 64)
-    depth: Tensor  # (M, 64) of the surface, metres
-    found: Tensor  # (M, 64) bool: there is one, and it is not grazing
-    J_depth_state: Tensor  # (M, 64, 6 + K), zero where there is none
+    points_obj: Tensor  # (3, M, 64) start of the step, metres
+    normal_obj: Tensor  # (3, M, 64) gradient of the signed distance at `points_obj`
+    depth: Tensor  # (M, 64) depth of the surface, metres
+    found: Tensor  # (M, 64) bool, whether the ray meets a surface without grazing it
+    J_depth_state: Tensor  # (M, 64, 6 + K), zero where `found` is false
 
     def seen(self, before: Surface, depth: Tensor, usable: Tensor) -> Surface:
-        """Where to look from here; a pixel whose surface is not found keeps its last hit for the states that follow."""
+        """Where later states look; a pixel without a surface keeps its last hit."""
         points, normal = self.points_obj.detach(), self.normal_obj.detach()
         points = torch.where(self.found, points, before.points_obj)
         normal = torch.where(self.found, normal, before.normal_obj)
@@ -242,7 +242,7 @@ def near_surface(rays_cam: Rays, field: Field, state: State, where: Surface) -> 
 
 
 def depth_of(rays: ObjectRays, owner: Tensor, field: Field, where: Surface) -> Tensor:
-    """The depth (M, 64) by the very step that led from `where`: its derivatives are those that `near_surface` gives."""
+    """Depth (M, 64) by one Newton step from `where`, with derivatives equal to the ones of `near_surface`."""
     near = rays.depth_next_to(where.points_obj).detach()
     slope = (where.normal_obj * rays.direction_obj).sum(0).detach()
     step = field.value(rays.at(near), owner) / torch.where(where.usable, slope, -1.0)
@@ -250,7 +250,7 @@ def depth_of(rays: ObjectRays, owner: Tensor, field: Field, where: Surface) -> T
 
 
 def is_grazing(normal_obj: Tensor, direction_obj: Tensor) -> Tensor:
-    """Rays (M, R) so close to the tangent plane that their depth means nothing, by their cosine with the normal."""
+    """Mask (M, R) of rays so close to the tangent plane, by their cosine with the normal, that depth is meaningless."""
     slope = (normal_obj * direction_obj).sum(0)
     return slope.abs() <= _LEAST_RAY_COSINE * length(normal_obj, dim=0) * length(direction_obj, dim=0)
 
@@ -258,16 +258,16 @@ def is_grazing(normal_obj: Tensor, direction_obj: Tensor) -> Tensor:
 def matched_brightness(
     form: Brightness,
     left: Tensor,  # (N, M, R) grey levels
-    right: Tensor,  # (N, M, R) grey levels where the neighbourhoods land
-    weight: Tensor,  # (N, M, R) of the neighbours
+    right: Tensor,  # (N, M, R) grey levels where the neighbours land
+    weight: Tensor,  # (N, M, R) weights of the neighbours
     owner: Tensor,  # (M,) car of each block
     num_cars: int,
 ) -> Tensor:
-    """The left grey levels (N, M, R) brought to the brightness of the right image, car by car; differentiable.
+    """Bring the left grey levels (N, M, R) to the brightness of the right image, car by car and differentiably.
 
-    In closed form, by moments: "gain" makes the means equal by a factor, "affine" means and standard deviations by a
-    factor and an offset. Moments need no pixel to lie on its counterpart; a regression of one image on the other would
-    take contrast off at every pose that is not yet right.
+    The closed form uses moments: "gain" makes the means equal by a factor; "affine" makes the means and the standard
+    deviations equal by a factor and an offset. Moments do not require that pixels match their counterparts, while a
+    regression of one image on the other would reduce contrast at every wrong pose.
 
     Examples:
         >>> left, weight, owner = torch.tensor([[[90.0, 110.0]]]), torch.ones(1, 1, 2), torch.tensor([0])

@@ -1,7 +1,7 @@
-"""Pixels of the left image compared with the right one, each with its neighbourhood warped by one depth.
+"""This module compares pixels of the left image with the right one; one depth warps the neighbourhood of each pixel.
 
-Cameras, the rig's residual field and the pyramid level are in two lines per neighbour, `along_ray depth +
-along_baseline`, so a comparison at any depths is a few products and a lookup.
+The warp of a neighbour is a line in homogeneous pixels, `along_ray depth + along_baseline`. The line contains the
+cameras, the rig's residual field and the pyramid level, so a comparison at any depth needs a few products and a lookup.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from directshape_torch.numerics.tensors import all_along, made_once
 from directshape_torch.rows import OcclusionMap, PixelSamples, Rays, Rows
 from directshape_torch.state.cars import CarBatch
 
-# DSO's pattern of 8 neighbourhood pixels (Engel et al., Direct Sparse Odometry, fig. 4), as (du, dv).
+# This is DSO's pattern of 8 neighbourhood pixels (Engel et al., Direct Sparse Odometry, fig. 4), as (du, dv).
 DSO_PATTERN: tuple[tuple[int, int], ...] = ((0, -2), (-1, -1), (1, -1), (-2, 0), (0, 0), (2, 0), (-1, 1), (0, 2))
 CENTRE = DSO_PATTERN.index((0, 0))
-# c of the gradient weight c^2 / (c^2 + |grad I_l|^2) (DSO), grey levels per pixel.
+# This is c of the gradient weight c^2 / (c^2 + |grad I_l|^2) (DSO), in grey levels per pixel.
 GRADIENT_CONSTANT = 50.0
-# What is not so far in front of the right camera is not seen by it.
+# The right camera sees only points with at least this depth.
 _LEAST_DEPTH_M = 1e-6
 
 
@@ -37,18 +37,18 @@ def _pattern(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 class PhotometricRows(NamedTuple):
-    """The pixel set of a stage in M blocks of 64, each pixel with N neighbours."""
+    """`PhotometricRows` are the pixels of a stage in M blocks of 64, each pixel with N neighbours."""
 
     rays: Rays
     along_ray: Tensor  # (3, N, M, 64) homogeneous right pixel (at the pyramid level) per metre of depth
-    along_baseline: Tensor  # (3, M, 64) and at depth zero
+    along_baseline: Tensor  # (3, M, 64) homogeneous right pixel (at the pyramid level) at depth zero
     intensity_left: Tensor  # (N, M, 64) grey levels, brought to the brightness of the right image
-    pixel_weight: Tensor  # (M, 64) of the gradient; zero in empty places and outside of the set
-    neighbour_weight: Tensor  # (N, M, 64) zero for neighbours that the mask says are not on the car
+    pixel_weight: Tensor  # (M, 64) weight by the gradient; zero in empty places and outside of the set
+    neighbour_weight: Tensor  # (N, M, 64) zero for neighbours that the mask excludes from the car
     right: RightView
 
     def take(self, kept: Tensor, owner: Tensor) -> PhotometricRows:
-        """Some of the blocks (Q,), of cars (Q,) that are numbered anew."""
+        """The blocks `kept` (Q,), with new car numbers `owner` (Q,)."""
         return PhotometricRows(
             self.rays.take(kept, owner),
             self.along_ray.index_select(2, kept),
@@ -61,40 +61,40 @@ class PhotometricRows(NamedTuple):
 
 
 class RightView(NamedTuple):
-    """What each block is compared with: its frame's right image, and where nearer instances hide its car there."""
+    """A `RightView` holds, for each block, the right image of its frame and where nearer instances hide its car."""
 
-    pixels: Tensor  # (A,) grey levels of all frames at the pyramid level, behind one another
-    frame: Tensor  # (M, 4) first pixel of the block's frame, pixels from row to row, last column, last row
-    to_full: Tensor  # (M, 2) full-resolution pixel per pixel of the level, and that of level pixel 0
+    pixels: Tensor  # (A,) grey levels of all frames at the pyramid level, one after another
+    frame: Tensor  # (M, 4) first pixel of the block's frame, pixels per row, last column, last row
+    to_full: Tensor  # (M, 2) full-resolution pixels per level pixel, and full-resolution position of level pixel 0
     crop: Tensor  # (M, 6) where the car is looked up in an `OcclusionMap`
-    in_front: Tensor  # (M, 2) what covers it there must be below this to hide it
-    covering: Tensor  # (C, 2) the foremost instances of that map
+    in_front: Tensor  # (M, 2) an instance hides the car if its value in `covering` is below this
+    covering: Tensor  # (C, 2) the foremost instances of the `OcclusionMap`
 
     def take(self, kept: Tensor) -> RightView:
-        """Some of the blocks."""
+        """The view of the blocks `kept` (Q,)."""
         return self._replace(
             frame=self.frame[kept], to_full=self.to_full[kept], crop=self.crop[kept], in_front=self.in_front[kept]
         )
 
 
 class Comparison(NamedTuple):
-    """Right minus left grey levels of the neighbours, and the derivative by the depth of their pixel."""
+    """A `Comparison` holds right minus left grey levels of neighbours, and derivatives by depth of their pixel."""
 
     residual: Tensor  # (M, 64, N)
     J_residual_depth: Tensor  # (M, 64, N)
-    comparable: Tensor  # (M, 64) bool: every neighbour lands in the right image, the pixel is not hidden there
+    comparable: Tensor  # (M, 64) bool: every neighbour lands in the right image, where the pixel is visible
 
 
 @dataclass(frozen=True)
 class LeftPixels:
-    """What pixel sets are made of: all packed pixels of the left image, and both images."""
+    """`LeftPixels` holds all packed pixels of the left image and both images; pixel sets are made from it."""
 
     pixels: PixelSamples  # P packed pixels
-    packed: Rows  # how they fill the blocks of a `Sight`
-    rays: Rays  # of these blocks
+    packed: Rows  # how the pixels fill the blocks of a `Sight`
+    rays: Rays  # rays of these blocks
     pyramid: tuple[GreyPair, ...]  # both images at every level that a stage asks for
     hidden_right: OcclusionMap | None  # where nearer instances cover the right image; None: nowhere
-    mask_left: MaskCrops  # of the detections of the call
+    mask_left: MaskCrops  # masks of the detections of the call
 
     @classmethod
     def of(
@@ -105,12 +105,12 @@ class LeftPixels:
         hidden_right: OcclusionMap | None,
         mask_left: MaskCrops,
     ) -> LeftPixels:
-        """From pixels, and how they fill blocks."""
+        """`LeftPixels` of pixels and of how they fill blocks."""
         rays = Rays.of_rows(packed, pixels.origin_cam, pixels.ray_cam)
         return cls(pixels, packed, rays, tuple(pyramid), hidden_right, mask_left)
 
     def of_cars(self, keep: Tensor, num_cars: int) -> LeftPixels:
-        """The pixels of the cars where `keep` (B,) holds, of which there are so many."""
+        """The pixels of the `num_cars` cars where `keep` (B,) is true."""
         pixels = self.pixels.of_objects(keep)
         packed = Rows.of_sorted(pixels.object_index, num_cars)
         return LeftPixels.of(pixels, packed, self.pyramid, self.hidden_right, self.mask_left)
@@ -118,7 +118,7 @@ class LeftPixels:
     def rows(
         self, config: PhotometricConfig, cars: CarBatch, packed: Rows, row: Tensor, image_level: int
     ) -> PhotometricRows:
-        """Some of the pixels, rows (M, 64), with the left image's side of their residuals."""
+        """The pixels in `row` (M, 64), with the left part of their residuals."""
         owner, images = packed.blocks.owner, self.pyramid[image_level]
         frame = cars.frame_index[owner]
         uv_level = (self.pixels.uv[row].movedim(-1, 0)[:, None] + 0.5) * images.scale - 0.5 + _pattern(self.pixels.uv)
@@ -133,7 +133,7 @@ class LeftPixels:
         c2 = GRADIENT_CONSTANT**2
         weight = c2 / (c2 + self.pixels.gradient_magnitude[row] ** 2)
         neighbours = torch.ones_like(intensity)
-        if config.pixel_set != "hit":  # the paper's keeps those that are not on the car
+        if config.pixel_set != "hit":  # the paper's set keeps neighbours outside the car
             neighbours = self._neighbours_on_car(cars, owner, *uv_full)
         return PhotometricRows(
             Rays.of_rows(packed._replace(row=row), self.pixels.origin_cam, self.pixels.ray_cam),
@@ -148,10 +148,10 @@ class LeftPixels:
     def _warp_lines(
         self, cars: CarBatch, owner: Tensor, row: Tensor, scale: float, u: Tensor, v: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The warp of each neighbour as a line in homogeneous pixels of the level, `along_ray depth + along_baseline`.
+        """Return the warp of each neighbour as a line in homogeneous level pixels, `along_ray depth + along_baseline`.
 
-        Cameras, the rig's residual field and the level are all in it: an image point lies at `u_right = pinhole -
-        bias`, `v_right = pinhole + vertical`.
+        The line contains the cameras, the rig's residual field and the level: an image point lies at
+        `u_right = pinhole - bias`, `v_right = pinhole + vertical`.
         """
         pinhole = (cars.K_right @ cars.T_right_cam[:, :3])[owner].permute(1, 2, 0)[..., None]  # (3, 4, M, 1)
         shift_u, shift_v = 0.5 - self.pixels.bias_px[row], 0.5 + self.pixels.vertical_px[row]
@@ -166,10 +166,10 @@ class LeftPixels:
         return line[:, 0, None] * u + line[:, 1, None] * v + line[:, 2, None], line[:, 3]
 
     def _neighbours_on_car(self, cars: CarBatch, owner: Tensor, u: Tensor, v: Tensor) -> Tensor:
-        """One (N, M, 64) for neighbours on the car, zero for those that the mask gives to something else.
+        """Return weights (N, M, 64): one for neighbours on the mask of the car, zero for others.
 
-        All neighbours are warped with the centre's depth: background beside the contour would pull the depth of a small
-        car away from its surface.
+        All neighbours are warped with the depth of the centre, so background next to the contour would pull the depth
+        of a small car away from its surface.
         """
         last_row, last_column = (self.pyramid[0].sizes[cars.frame_index[owner]] - 1)[:, :, None].unbind(1)
         inside = (u >= -0.5) & (v >= -0.5) & (u <= last_column + 0.5) & (v <= last_row + 0.5)
@@ -190,14 +190,14 @@ class LeftPixels:
 
 
 def is_on_mask(mask_left: MaskCrops, row: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Where points (..., M, 64) of left images are on the masks of the detections in rows (M,), or beside the image."""
+    """Whether points (..., M, 64), clamped to the left image, are on the masks of the detections in rows (M,)."""
     height, width = mask_left.size_hw
     at_u, at_v = (x.round().long().clamp(0, last - 1) for x, last in ((u, width), (v, height)))
     return mask_left.at(row[:, None], at_u, at_v) > MASK_THRESHOLD
 
 
 def frame_view(images: GreyPair, frame: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """First pixel of frames (M,), pixels from row to row, last column, last row: (M, 1) each."""
+    """First pixel, pixels per row, last column and last row of frames (M,), (M, 1) each."""
     _, height, width = images.right.shape
     last_row, last_column = (images.sizes[frame] - 1).unbind(1)
     columns = frame * (height * width), torch.full_like(frame, width), last_column, last_row
@@ -206,7 +206,7 @@ def frame_view(images: GreyPair, frame: Tensor) -> tuple[Tensor, Tensor, Tensor,
 
 
 def compared(rows: PhotometricRows, depth: Tensor) -> Comparison:
-    """Residuals at depths (M, 64) with their derivatives, all neighbours warped with the pixel's own depth."""
+    """Residuals at depths (M, 64) with their derivatives; all neighbours are warped with the depth of their pixel."""
     warped = warped_pixels(rows, depth)
     along, at = rows.along_ray, warped.at
     d_u = torch.addcmul(along[0], warped.u, along[2], value=-1) * warped.inverse_z
@@ -216,13 +216,13 @@ def compared(rows: PhotometricRows, depth: Tensor) -> Comparison:
 
 
 def residuals_at(rows: PhotometricRows, depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Residuals (..., M, 64, N) at depths (..., M, 64), and where (..., M, 64) they can be compared; differentiable."""
+    """Differentiable residuals (..., M, 64, N) at depths (..., M, 64), and a mask (..., M, 64) of comparable pixels."""
     warped = warped_pixels(rows, depth)
     return warped.residual(rows), warped.is_comparable(rows.right)
 
 
 class Warped(NamedTuple):
-    """Neighbours (..., N, M, 64) in the right image, at the pyramid level."""
+    """`Warped` holds neighbours (..., N, M, 64) in the right image, at the pyramid level."""
 
     u: Tensor
     v: Tensor
@@ -235,7 +235,7 @@ class Warped(NamedTuple):
         return (self.at.value - rows.intensity_left).movedim(-3, -1)
 
     def is_comparable(self, right: RightView) -> Tensor:
-        """Pixels (..., M, 64) all of whose neighbours land in the right image, and that nothing nearer hides there."""
+        """Mask (..., M, 64) of pixels that are visible in the right image and whose neighbours all land in it."""
         inside = all_along(self.at.inside & self.in_front, dim=-3)
         u, v = (x[..., CENTRE, :, :].detach() for x in (self.u, self.v))
         return inside & ~_is_hidden(right, u, v)

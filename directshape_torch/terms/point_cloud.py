@@ -1,8 +1,8 @@
-"""Points of a car, `lambda / P sum_p Huber(sdf(T_obj_cam X_p))`, the mean over its points (Engelmann et al., 2016).
+"""This term pulls the surface of a car to its points (Engelmann et al., 2016).
 
-A point that lies on the surface has no residual. It is fixed in the camera; the state moves it in the object frame. The
-points may come from dense stereo (the methods "geometric" and "combined") or from a LiDAR. Derivation:
-docs/derivations/point_cloud.md.
+The cost `lambda / P sum_p Huber(sdf(T_obj_cam X_p))` is a mean over the points. The residual of a point on the surface
+is zero. A point is fixed in the camera frame; the state moves it in the object frame. The points may come from dense
+stereo (the methods "geometric" and "combined") or from a LiDAR. The derivation is in docs/derivations/point_cloud.md.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from directshape_torch.terms.term import Linear, Term, Where
 
 @dataclass(frozen=True)
 class PointCloud(Term):
-    """See module. Build with `of_points`; the points are those of the whole refinement."""
+    """A `PointCloud` is built with `of_points`; its points stay fixed for the whole refinement."""
 
-    name: str  # of the term
+    name: str  # name of the term
     huber_m: float  # corner of the norm, metres
     all_blocks: Blocks  # M blocks
-    points_cam: Rays  # points as rays from the camera that are there at the depth 1, (M, 64) places
+    points_cam: Rays  # rays from the camera that reach the points at depth 1, (M, 64) places
     filled: Tensor  # (M, 64) 1 in filled places, else 0
     weight: Tensor  # (M,) float64, lambda over the number of points of the car
 
     @classmethod
     def of_points(cls, config: PointCloudConfig, points: PointSamples, name: str = "point_cloud") -> PointCloud:
-        """The term of the cars whose points these are; a car with fewer than `min_points` has no part in it."""
+        """The term of the cars with these points; a car with fewer than `min_points` has no rows."""
         num_cars = len(points.counts)
         enough = points.counts >= config.min_points
         chosen = enough[points.object_index].nonzero()[:, 0]

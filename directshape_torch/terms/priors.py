@@ -1,7 +1,7 @@
-"""Priors, `lambda r^2 / 2`: shape code, height above the ground, tilt against it, the detector's box, the rig.
+"""This module has the priors `lambda r^2 / 2` on shape code, height above the ground, tilt, detector's box and rig.
 
-Each residual is a function of the cars and a state that returns it with its Jacobian by the unknowns that it sees; a
-prior of one's own is such a function in a `PriorTerm` (docs/extra_terms.md). Derivations: docs/derivations/priors.md.
+A function of the cars and a state returns each residual with its Jacobian by the unknowns that it sees. A user's prior
+is a function of this kind in a `PriorTerm` (docs/extra_terms.md). The derivations are in docs/derivations/priors.md.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from directshape_torch.terms import robust
 from directshape_torch.terms.term import Linear, Term, Where
 
 RIG_WEIGHT = 0.2
-"""Of the offset of the disparity, in its standard deviations: that of the detector's pose, with which it is weighed."""
+"""The offset of the disparity, in standard deviations, has the weight of the detector's pose."""
 
 
 class PriorResidual(NamedTuple):
-    """Residual of a prior for B cars, with its Jacobian."""
+    """A `PriorResidual` is the residual of a prior for B cars, with its Jacobian."""
 
     residual: Tensor  # (B, R)
     J_residual_state: Tensor  # (B, R, S) by the unknowns that the term sees, block after block
@@ -41,23 +41,23 @@ class PriorResidual(NamedTuple):
 
 @dataclass(frozen=True)
 class PriorTerm(Term):
-    """`weight * sum_i r_i^2 / 2` of a residual of the state alone: one block of R rows for each car.
+    """A `PriorTerm` costs `weight * sum_i r_i^2 / 2` for a residual of the state; each car has one block of R rows.
 
     Raises:
         InputError: the weight is no number; a value is no tensor with a row for each detection of the call, or has
             another device or, in floating point, another dtype than the cars.
     """
 
-    name: str  # of the term
+    name: str  # name of the term
     weight: float  # lambda
     cars: CarBatch  # constants of the cars
-    # The residual with its Jacobian, or the residual (B, R) alone, which is then differentiated automatically; from the
-    # constants, a state and, by name, the rows (B, ...) of the values.
+    # The function takes the constants, a state and, by name, the rows (B, ...) of the values. It returns the residual
+    # with its Jacobian, or the residual (B, R) alone, which is then differentiated automatically.
     residual_of: Callable[..., PriorResidual | Tensor]
     num_rows: int  # R
     sees: tuple[str, ...] = (POSE, CODE)  # the blocks of unknowns of its Jacobian
-    is_prior: bool = True  # False for what belongs to the measurements
-    # What else the residual needs to know of each car: tensors (N, ...) of all N detections of the call.
+    is_prior: bool = True  # false for a part of the measurements
+    # Further values that the residual needs for each car are tensors (N, ...) of all N detections of the call.
     values: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -73,7 +73,7 @@ class PriorTerm(Term):
             check_alike(named, value, "the cars", depth if value.is_floating_point() else depth.to(value.dtype))
 
     def _at(self, state: State) -> PriorResidual | Tensor:
-        """What `residual_of` says of a state, from the rows of the cars that are left."""
+        """The result of `residual_of` at a state, with the values of the remaining cars."""
         rows = self.cars.detection_row
         at = self.residual_of(self.cars, state, **{name: x.index_select(0, rows) for name, x in self.values.items()})
         if not isinstance(at, (Tensor, PriorResidual)):
@@ -132,7 +132,7 @@ class PriorTerm(Term):
 
 
 def prior_terms(config: PriorConfig, prior: ShapePrior, cars: CarBatch) -> list[PriorTerm]:
-    """Shape, height, tilt, dimensions, pose where its sigma is known, and the rig where its disparity is not."""
+    """Priors of shape, height, tilt, dimensions, pose where its sigma is known, and rig where an offset is unknown."""
 
     def of_shape(_: CarBatch, state: State) -> PriorResidual:
         return shape_prior(state.code)
@@ -155,20 +155,20 @@ def prior_terms(config: PriorConfig, prior: ShapePrior, cars: CarBatch) -> list[
     if cars.detector_pose_sigma is not None or any(config.pose_sigmas):
         all_terms.append(PriorTerm("pose", config.pose_weight, cars, of_pose, 4, (POSE,)))
     if cars.num_offsets:
-        # How well a disparity is measured: what the images say of a car holds no more than that.
+        # This prior belongs to the measurements, because it limits how well the images measure a car.
         all_terms.append(PriorTerm("rig", RIG_WEIGHT, cars, rig_prior, 1, (OFFSET,), is_prior=False))
     return [term for term in all_terms if term.weight > 0]
 
 
 def joined(terms: Sequence[PriorTerm]) -> PriorTerm:
-    """One term that costs what priors of pose and shape do together: an iteration asks for the sum alone."""
+    """One term with the total cost of priors of pose and shape, because an iteration needs only the sum."""
 
     def residual_of(cars: CarBatch, state: State) -> PriorResidual:
         unknowns = state.unknowns.only(POSE, CODE)
         scaled = []
         for term in terms:
             at = term.residual_of(cars, state)
-            assert isinstance(at, PriorResidual)  # as ours are
+            assert isinstance(at, PriorResidual)  # priors of this library have Jacobians
             J = unknowns.placed(at.J_residual_state, term.sees)
             scaled.append([math.sqrt(term.weight) * x for x in (at.residual, J)])
         return PriorResidual(*(torch.cat(parts, dim=1) for parts in zip(*scaled, strict=True)))
@@ -177,32 +177,33 @@ def joined(terms: Sequence[PriorTerm]) -> PriorTerm:
 
 
 def detector_pose_sigma(config: PriorConfig, cars: CarBatch) -> Tensor:
-    """Standard deviations (B, 4) of the input poses, see `Detections.pose_sigma`; infinite where nobody knows them."""
+    """Standard deviations (B, 4) of the input poses, see `Detections.pose_sigma`; infinite where they are unknown."""
     if cars.detector_pose_sigma is not None:
         return cars.detector_pose_sigma
     along_share, *constant = config.pose_sigmas
     origin = cars.detector_T_cam_obj[:, :3, 3]
     sigma = constant_like(tuple(s if s > 0 else math.inf for s in constant), origin).repeat(len(origin), 1)
     if along_share > 0:
-        # constant[0], for infinity stands for nothing known here.
+        # This uses constant[0], because a constant of zero is infinite in `sigma`.
         distance = torch.hypot(origin[:, 0], origin[:, 2])
         sigma[:, 0] = torch.sqrt((along_share * distance) ** 2 + constant[0] ** 2)
     return sigma
 
 
 def shape_prior(code: Tensor) -> PriorResidual:
-    """Pulls the whitened code (B, K) to the mean shape (paper, E_shape; sigma is folded into the basis)."""
+    """This prior pulls the whitened code (B, K) to the mean shape (paper, E_shape; the basis includes sigma)."""
     num_cars, num_codes = code.shape
     identity = torch.eye(num_codes, dtype=code.dtype, device=code.device)
     return PriorResidual(code, identity.expand(num_cars, -1, -1))
 
 
 def height_prior(cars: CarBatch, state: State) -> PriorResidual:
-    """Height of the object origin against the ground plane, along the camera's y axis (paper, r_trans), metres.
+    """Measure the height of the object origin over the ground, along the camera's y axis (paper, r_trans), in metres.
 
-    `r = (n . t + d) / n_y` with t the object origin in the camera frame, which moves by `-R_cam_obj v`.
+    The residual is `r = (n . t + d) / n_y`, where t is the object origin in the camera frame and moves by
+    `-R_cam_obj v`.
     """
-    # With `t = -R_cam_obj p`, p the translation of T_obj_cam, `n . t = -n_obj . p`.
+    # With the translation p of T_obj_cam, `t = -R_cam_obj p`, so `n . t = -n_obj . p`.
     n_obj, n_y = _ground_normal_obj(cars, state), cars.ground_normal_cam[:, 1]
     residual = (cars.ground_offset - (n_obj * state.T_obj_cam[:, :3, 3]).sum(-1)) / n_y
     J_v = -n_obj / n_y[:, None]
@@ -210,9 +211,9 @@ def height_prior(cars: CarBatch, state: State) -> PriorResidual:
 
 
 def tilt_prior_normal(cars: CarBatch, state: State) -> PriorResidual:
-    """Horizontal components of the ground normal in the object frame: zero for a car that stands on the ground.
+    """Return the horizontal components of the ground normal in the object frame, zero for a car that stands level.
 
-    `n_obj = R_obj_cam n`, `r = (n_obj.x, n_obj.z)`; unlike the paper's form its Jacobian does not vanish at zero.
+    `n_obj = R_obj_cam n`, `r = (n_obj.x, n_obj.z)`. This Jacobian is nonzero at r = 0, unlike in the paper's form.
     """
     x, y, z = _ground_normal_obj(cars, state).unbind(-1)
     zero = torch.zeros_like(x)
@@ -221,7 +222,7 @@ def tilt_prior_normal(cars: CarBatch, state: State) -> PriorResidual:
 
 
 def tilt_prior_cosine(cars: CarBatch, state: State) -> PriorResidual:
-    """The paper's `r_rot = 1 - (R_cam_obj [0, -1, 0]) . n = 1 + n_obj.y`; its Jacobian vanishes where r does."""
+    """The paper's `r_rot = 1 - (R_cam_obj [0, -1, 0]) . n = 1 + n_obj.y`; its Jacobian is zero where r is zero."""
     x, y, z = _ground_normal_obj(cars, state).unbind(-1)
     J_omega = torch.stack([-z, torch.zeros_like(x), x], dim=-1)[:, None]
     return PriorResidual((1 + y)[:, None], _by_rotation(J_omega))
@@ -232,18 +233,18 @@ def _ground_normal_obj(cars: CarBatch, state: State) -> Tensor:
 
 
 def _by_rotation(J_omega: Tensor) -> Tensor:
-    """Jacobian by the pose of a residual that only rotation changes, from its part (B, R, 3)."""
+    """Jacobian by the pose of a residual that only rotation changes, from its Jacobian (B, R, 3) by omega."""
     return torch.nn.functional.pad(J_omega, (3, 0))
 
 
 def dimensions_prior(
-    shape: DimensionsDerivative,  # of B shapes
+    shape: DimensionsDerivative,  # dimensions of B shapes
     detector_hwl: Tensor,  # (B, 3) metres
     sigma_hwl: Tensor,  # (3,) metres
 ) -> PriorResidual:
-    """Shape dimensions against the detector's, in the detector's standard deviations.
+    """Compare the dimensions of the shape with the detector's, in the detector's standard deviations.
 
-    A car seen from behind does not show its length: the detector's dimensions are information (not in the paper).
+    The paper lacks this prior. A car seen from behind hides its length, which the detector's dimensions provide.
     """
     return PriorResidual((shape.hwl - detector_hwl) / sigma_hwl, shape.J_hwl_code / sigma_hwl[:, None])
 
@@ -251,12 +252,12 @@ def dimensions_prior(
 def pose_prior(
     T_obj_cam: Tensor,  # (B, 4, 4)
     detector_T_cam_obj: Tensor,  # (B, 4, 4) input pose
-    sigma: Tensor,  # (B, 4) along the viewing ray, across it, vertically (metres), heading (radians); infinite: no part
+    sigma: Tensor,  # (B, 4) along the viewing ray, across it, vertically (metres), heading (radians); infinite: unknown
 ) -> PriorResidual:
-    """Object origin and heading against the detector's, in the detector's standard deviations (not in the paper).
+    """Compare the object origin and the heading with the detector's, in the detector's standard deviations.
 
-    The axes are those of the detector's viewing ray, so they stay while the car moves; the heading is the angle about
-    the camera's y axis from the detector's x axis to the car's, in (-pi, pi].
+    The paper lacks this prior. The axes belong to the detector's viewing ray, so they are fixed while the car moves.
+    The heading is the angle about the camera's y axis from the detector's x axis to the car's x axis, in (-pi, pi].
     """
     T_cam_obj = se3.inverse(T_obj_cam)
     R_cam_obj, axes = T_cam_obj[:, :3, :3], viewing_axes(detector_T_cam_obj[:, :3, 3])
@@ -271,9 +272,9 @@ def pose_prior(
 
 
 def J_heading_omega(R_obj: Tensor) -> Tensor:
-    """Derivative (B, 3) of the heading `atan2(-h_z, h_x)` of cars of rotation (B, 3, 3) by omega; h is their x axis.
+    """Return the derivative (B, 3) by omega of the heading `atan2(-h_z, h_x)`; h is the x axis of a car in `R_obj`.
 
-    It moves by R (e_x x omega) = omega_y R[:, 2] - omega_z R[:, 1], its angle by (h_z dh_x - h_x dh_z) / |h|^2.
+    h moves by R (e_x x omega) = omega_y R[:, 2] - omega_z R[:, 1], and its angle by (h_z dh_x - h_x dh_z) / |h|^2.
     """
     x_axis, dh_y, dh_z = R_obj[:, 0::2, 0], R_obj[:, 0::2, 2], -R_obj[:, 0::2, 1]
     by_y, by_z = (x_axis[:, 1] * dh[:, 0] - x_axis[:, 0] * dh[:, 1] for dh in (dh_y, dh_z))
@@ -281,7 +282,7 @@ def J_heading_omega(R_obj: Tensor) -> Tensor:
 
 
 def rig_prior(cars: CarBatch, state: State) -> PriorResidual:
-    """Offset of the disparity in its standard deviations; pixels for a car that has none, whose offset stays 0."""
+    """Offset of the disparity in standard deviations; for a car without a sigma, in pixels, where it stays 0."""
     assert cars.offset_sigma_px is not None
     sigma = torch.where(cars.offset_sigma_px > 0, cars.offset_sigma_px, 1.0)[:, None]
     return PriorResidual(state.offset_px / sigma, (1 / sigma)[:, None])

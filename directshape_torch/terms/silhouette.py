@@ -1,12 +1,12 @@
-"""Silhouettes: does the projected shape agree with the instance masks of both images? (paper, E_silh and r_silh)
+"""This term compares the projected shape with the instance masks of both images (paper, E_silh and r_silh).
 
-`r = -log(pi p_fg + (1 - pi) p_bg)` for every ray, with the projection `pi = sigmoid(-zeta m)` of the least signed
-distance m along it. By the envelope theorem the Jacobian of m is that of the point where it is taken. Derivation:
-docs/derivations/silhouette_closest_approach.md.
+The residual of a ray is `r = -log(pi p_fg + (1 - pi) p_bg)`, with the projection `pi = sigmoid(-zeta m)` of the least
+signed distance m along the ray. By the envelope theorem the Jacobian of m is the Jacobian of the signed distance at the
+closest point. The derivation is in docs/derivations/silhouette_closest_approach.md.
 
 The paper's projection is a product over the samples of each ray, `pi = 1 - prod_s 1 / (exp(Phi_s zeta) + 1)`. It
-dilates the contour and is there to be faithful to the paper (`SilhouetteProducts`,
-docs/derivations/silhouette_product.md).
+dilates the contour. `SilhouetteProducts` provides it for fidelity to the paper, and its derivation is in
+docs/derivations/silhouette_product.md.
 """
 
 from __future__ import annotations
@@ -37,37 +37,37 @@ from directshape_torch.terms.depth import (
 )
 from directshape_torch.terms.term import Linear, Sight, Term, Where
 
-# Of zeta, per metre.
+# Zeta stays within these bounds, per metre.
 ZETA_BOUNDS = (4.0, 400.0)
-# |zeta sdf| from which the projection is certain and has no gradient (closest approach only).
+# For |zeta sdf| above this, the projection by closest approach is certain and has no gradient.
 SATURATION = 16.0
-# The smallest residual in the reweighting 1/r.
+# The reweighting 1/r uses at least this residual.
 _RESIDUAL_FLOOR = 0.01
-# A ray is near the contour where |zeta sdf| is below this: beyond, its slope is at most 4 % of the steepest.
+# A ray is near the contour where |zeta sdf| is below this; further away its slope is at most 4 % of the steepest.
 IN_PLAY_EXPONENT = 8.0
-# And as far again as the contour may move during a stage, beyond which the next stage picks it up.
+# The contour may move by this much during a stage; the next stage adds rays that it reaches beyond this margin.
 _IN_PLAY_MARGIN_M = 0.2
-# Where a wider contour has gone before, what is left to move is little: no more than a narrow contour's own reach.
+# After a stage with a wider contour the remaining motion is small, so zeta times the margin is at most this.
 _MARGIN_EXPONENT_AFTER_WIDER = 10.0
 
 
 @dataclass(frozen=True)
 class MaskRows:
-    """The rays of both images with what the masks say, in blocks; shared by both forms of the projection."""
+    """`MaskRows` are the rays of both images in blocks, with their masks; both forms of the projection use them."""
 
-    blocks: Blocks  # M blocks, first those of the left image, then of the right one
-    rays: Rays  # of these blocks
+    blocks: Blocks  # M blocks, first all of the left image, then all of the right one
+    rays: Rays  # rays of these blocks
     side: Tensor  # (M,) 0 for the left image, 1 for the right one
     foreground: Tensor  # (M, 64) probability of the mask, clamped
     filled: Tensor  # (M, 64) 1 in filled places, else 0
     weight: Tensor  # (M,) float64, lambda over the number of rays that the car has in this image
-    left_counts: tuple[int, ...]  # (B,) blocks of the left image, which the host knows
+    left_counts: tuple[int, ...]  # (B,) numbers of blocks of the left image, known to the host
 
     @classmethod
     def of_pixels(
         cls, pixels: Sequence[PixelSamples], sides: Sequence[Rows], config: SilhouetteConfig, num_cars: int
     ) -> MaskRows:
-        """From the packed pixels of the left and the right image, and how they fill blocks."""
+        """`MaskRows` from the packed pixels of the left and the right image, and from how they fill blocks."""
         rays = [Rays.of_rows(rows, p.origin_cam, p.ray_cam) for rows, p in zip(sides, pixels, strict=True)]
         owner = torch.cat([r.owner for r in rays])
         filled = torch.cat([rows.filled for rows in sides])
@@ -87,11 +87,11 @@ class MaskRows:
         )
 
     def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> MaskRows:
-        """The rows of the cars where `keep` (B,) holds, `numbers` of them."""
+        """The rows of the cars where `keep` (B,) is true; the host knows their `numbers`."""
         return self.kept_of_cars(keep, numbers)[0]
 
     def kept_of_cars(self, keep: Tensor, numbers: Sequence[int]) -> tuple[MaskRows, Tensor]:
-        """The same, and which (Q,) of the blocks they are."""
+        """The rows of the cars where `keep` (B,) is true, and the numbers (Q,) of their old blocks."""
         blocks, kept = self.blocks.of_cars(keep, numbers)
         of_blocks = (x.index_select(0, kept) for x in (self.side, self.foreground, self.filled, self.weight))
         side, foreground, filled, weight = of_blocks
@@ -100,12 +100,12 @@ class MaskRows:
         return MaskRows(blocks, rays, side, foreground, filled, weight, left_counts), kept
 
     def chosen(self, rays: Tensor) -> tuple[MaskRows, Tensor]:
-        """Some of the rays (M, 64) bool, packed anew, and the place (Q, 64) of each among the flat places (M * 64)."""
+        """The rays chosen by a mask (M, 64), in new blocks, and their places (Q, 64) among the old places (M * 64)."""
         place = rays.flatten().nonzero()[:, 0]
         num_cars = len(self.blocks.counts)
         block = place // rays.shape[1]
         of_side = self.rays.owner + num_cars * self.side
-        # Blocks are sorted by side, then by car: numbered so, rays of one image and car lie side by side.
+        # Blocks are sorted by side, then by car, so with this number rays of one image and car are adjacent.
         packed = Rows.of_sorted(of_side.index_select(0, block), 2 * num_cars)
         places = place[packed.row]
         first = places[:, 0] // rays.shape[1]
@@ -124,25 +124,25 @@ class MaskRows:
         ), places
 
     def of_sides(self) -> tuple[Rays, Rays]:
-        """The rays of the left and of the right image by themselves."""
+        """The rays of the left image, and the rays of the right image."""
         num_left = sum(self.left_counts)
         left, right = torch.arange(len(self.side), device=self.side.device).tensor_split([num_left])
         return self.rays.take(left, self.rays.owner[left]), self.rays.take(right, self.rays.owner[right])
 
     def residual_of_a_miss(self) -> Tensor:
-        """Of rays (M, 64) that do not come near the car at all: `-log p_bg`."""
+        """Residual `-log p_bg` (M, 64) of rays that stay far from the car."""
         return -torch.log1p(-self.foreground)
 
 
 def contour_zeta(cars: CarBatch, stage: StageConfig) -> Tensor:
-    """Steepness (B,) of the projection per metre: a contour as wide as the stage says, in pixels at the input depth."""
+    """Steepness (B,) of the projection per metre, from the stage's contour width in pixels at the input depth."""
     zeta = cars.focal_over_depth / stage.contour_width_px
     return zeta.clamp(*ZETA_BOUNDS)
 
 
 @dataclass(frozen=True)
 class SilhouetteEvidence:
-    """What the masks show of B cars, of which the silhouette term of each stage is made: an `Evidence`."""
+    """This `Evidence` is what the masks show of B cars; each stage makes its silhouette term of it."""
 
     config: SilhouetteConfig  # weight and forms
     cars: CarBatch  # B cars
@@ -162,7 +162,7 @@ class SilhouetteEvidence:
 
 @dataclass(frozen=True)
 class Silhouettes(Term):
-    """The term of both images in a stage, with the projection by closest approach; see module."""
+    """`Silhouettes` is the term of both images in a stage, with the projection by closest approach."""
 
     config: SilhouetteConfig  # weight and forms
     cars: CarBatch  # B cars
@@ -193,7 +193,7 @@ class Silhouettes(Term):
         return self.rows.filled[..., None]
 
     def moving(self, sight: Sight, after_wider: bool) -> tuple[Self, Where, Tensor]:
-        """Rays near the contour, or that may come to be: the others are certain, whatever the next steps do."""
+        """Keep the rays that are or may come near the contour; the other rays stay certain during the next steps."""
         distance = self._least_distance(sight)
         margin = _IN_PLAY_MARGIN_M * self.zeta
         if after_wider:
@@ -227,7 +227,7 @@ class Silhouettes(Term):
         points = rays.at(where.depth)
         across = (where.face_obj * rays.direction_obj).sum(0).detach()
         is_kink = across != 0
-        # At a kink the point stays on its face; at a smooth minimum the depth does not matter.
+        # At a kink the point stays on its face; at a smooth minimum the depth has no first-order effect.
         off_face = (where.face_obj * (points - where.points_obj)).sum(0)
         depth = where.depth - torch.where(is_kink, off_face / torch.where(is_kink, across, 1.0), 0.0)
         sdf = field.value(rays.at(depth), self.rows.rays.owner)
@@ -244,7 +244,7 @@ class Silhouettes(Term):
         return sight.field.value(sight.closest.points_obj, self.rows.rays.owner)
 
     def _of_distance(self, sdf: Tensor, crosses: Tensor) -> tuple[Tensor, Tensor]:
-        """Residual (M, R) of least distances and its derivative by them; rays that miss the bounds have a constant."""
+        """Residual (M, R) of least distances, and its derivative; rays outside the bounds have a constant residual."""
         of_closest = closest_approach_residual(sdf, self.zeta, self.rows.foreground)
         elsewhere = self.rows.residual_of_a_miss(), torch.zeros_like(sdf)
         residual, slope = (torch.where(crosses, x, y) for x, y in zip(of_closest, elsewhere, strict=True))
@@ -256,11 +256,11 @@ def closest_approach_residual(
     zeta: Tensor,  # broadcastable to (..., P), per metre
     foreground: Tensor,  # (..., P)
 ) -> tuple[Tensor, Tensor]:
-    """Residual and `J_residual_sdf` (..., P) at the point of closest approach, zero where saturated.
+    """Return the residual and `J_residual_sdf` (..., P) at the point of closest approach.
 
-    `pi = sigmoid(-zeta m)`; beyond `|zeta m| = SATURATION` the projection is certain. Without logarithms: of pi and
-    1 - pi the smaller one is a quotient and no difference, so the likelihood `A = pi p_fg + (1 - pi) p_bg` loses no
-    digit. `d r / d sdf = zeta pi (1 - pi) (p_fg - p_bg) / A`.
+    The projection is `pi = sigmoid(-zeta m)`; beyond `|zeta m| = SATURATION` it is certain and the Jacobian is zero.
+    Both pi and 1 - pi are computed as sigmoids, without a difference, so the likelihood `A = pi p_fg + (1 - pi) p_bg`
+    keeps all its digits. The Jacobian is `d r / d sdf = zeta pi (1 - pi) (p_fg - p_bg) / A`.
 
     Examples:
         >>> on_contour = (torch.zeros(1), torch.full((1,), 2.0), torch.full((1,), 0.75))
@@ -277,14 +277,14 @@ def closest_approach_residual(
 
 def sdf_state_jacobian(
     points_obj: Tensor,  # (3, M, R) metres
-    gradient: Tensor,  # (3, M, R) of the signed distance
+    gradient: Tensor,  # (3, M, R) gradient of the signed distance
     at: Lookup,
 ) -> Tensor:
-    """`J_sdf_state = [grad, X x grad, basis]` (M, R, 6 + K): per metre, per radian, per standard deviation.
+    """Return `J_sdf_state = [grad, X x grad, basis]` (M, R, 6 + K): per metre, per radian, per standard deviation.
 
-    The last factor of every chain. The state is moved by `delta = (v, omega, dcode)` with `T_obj_cam <- exp(delta[:6])
-    T_obj_cam`, so a point fixed in the camera frame moves in the object frame by `v + omega x X` (paper, supplement,
-    generators of SE(3)).
+    This Jacobian is the last factor of every chain rule. The state is moved by `delta = (v, omega, dcode)` with
+    `T_obj_cam <- exp(delta[:6]) T_obj_cam`, so a point fixed in the camera frame moves in the object frame by
+    `v + omega x X` (paper, supplement, generators of SE(3)).
     """
     (x, y, z), (u, v, w) = points_obj.unbind(0), gradient.unbind(0)
     J_sdf_pose = torch.stack([u, v, w, y * w - z * v, z * u - x * w, x * v - y * u], dim=-1)
@@ -292,7 +292,7 @@ def sdf_state_jacobian(
 
 
 class Samples(NamedTuple):
-    """Where the rays of a state are sampled."""
+    """`Samples` holds the depths at which the rays of a state are sampled."""
 
     depths: Tensor  # (S, M, 64) metres
     crosses: Tensor  # (M, 64) bool
@@ -300,10 +300,10 @@ class Samples(NamedTuple):
 
 @dataclass(frozen=True)
 class SilhouetteProducts(Silhouettes):
-    """The term of both images with the paper's projection; rays and weights are those of `Silhouettes`.
+    """`SilhouetteProducts` is the term of both images with the paper's projection.
 
-    Everything is kept in log space, so that rays deep inside or far outside lose no digits. The samples of a ray are
-    fixed shares of its interval with the prior's bounds, constants of a linearisation.
+    It computes in log space, so that rays deep inside or far outside keep all digits. The samples of a ray are at fixed
+    shares of its interval with the prior's bounds, and are constants of a linearisation.
     """
 
     moving, where = Term.moving, Term.where
@@ -315,11 +315,11 @@ class SilhouetteProducts(Silhouettes):
         if constant:
             depths, sdf, crosses = march(field, owner, rays, self.bounds_obj, num_samples)
         else:
-            # The samples move with the bounds: a constant of this linearisation, but not of its derivative.
+            # The samples are constants of this linearisation, but move with the bounds in its derivative.
             depths, crosses = sample_depths(rays, self.bounds_obj, num_samples)
             sdf = field.value(rays.at(depths), owner)
         residual, J_residual_sdf = product_residual(sdf, self.zeta, self.rows.foreground)
-        # One sample at a time: a Jacobian per sample is never kept.
+        # The sum goes sample by sample, so that memory holds no Jacobian for each sample.
         J = torch.zeros(0)
         for number, depth in enumerate(depths):
             points = rays.at(depth)
@@ -342,16 +342,16 @@ def product_residual(
     zeta: Tensor,  # broadcastable to (...), per metre
     foreground: Tensor,  # (...)
 ) -> tuple[Tensor, Tensor]:
-    """Residual (...) and `J_residual_sdf` (S, ...) of the paper's product form.
+    """Return the residual (...) and `J_residual_sdf` (S, ...) of the paper's product form.
 
-    `log (1 - pi) = -sum_s softplus(-zeta sdf_s)`, `d pi / d sdf_s = -zeta (1 - pi) sigmoid(-zeta sdf_s)` and
+    It uses `log (1 - pi) = -sum_s softplus(-zeta sdf_s)`, `d pi / d sdf_s = -zeta (1 - pi) sigmoid(-zeta sdf_s)` and
     `d r / d pi = -(p_fg - p_bg) / A` (paper, supplement, eqs. for dA/dpi, dpi/dPhi and dC/dPhi; Phi = -sdf).
 
     Examples:
         >>> product_residual(torch.zeros(1, 1), torch.ones(1), torch.full((1,), 0.99))[0]
         tensor([0.6931])
     """
-    # -softplus(-x) = logsigmoid(x), which has no cut-off, unlike `softplus`.
+    # `logsigmoid(x)` equals -softplus(-x) but has no cut-off, unlike `softplus`.
     log_miss = logsigmoid(zeta * sdf).sum(dim=0)
     log_hit = log_one_minus_exp(log_miss)
     residual = -torch.logaddexp(log_hit + foreground.log(), log_miss + torch.log1p(-foreground))

@@ -1,8 +1,8 @@
-"""What every term of the energy is, and the one function that sums terms into cost, gradient and matrices.
+"""This module defines a term of the energy and sums terms into cost, gradient and matrices.
 
-A row of a term sees the state of its car through one scalar, `inner`: the signed distance at the closest point of a
-ray, the depth of the surface under a pixel (which all its neighbours share), or the residual itself. So a term gives
-factors, and its Jacobian is never kept: `J_residual_state = J_residual_inner J_inner_state`.
+A row of a term depends on the state of its car through one scalar, `inner`: the signed distance at the closest point of
+a ray, the depth of the surface under a pixel (which all neighbours of the pixel share), or the residual itself. A term
+therefore gives its Jacobian only in factors: `J_residual_state = J_residual_inner J_inner_state`.
 """
 
 from __future__ import annotations
@@ -24,70 +24,70 @@ from directshape_torch.terms.depth import Closest, Hits
 from directshape_torch.terms.robust import RobustValue
 
 Where: TypeAlias = Any
-"""Where the rows of a term look: a tensor (..., M, R) or a named tuple of such, constants; `()` for nowhere."""
+"""`Where` is where the rows of a term look: a constant tensor (..., M, R), a named tuple of these, or `()`."""
 
 
 class Sight(NamedTuple):
-    """What the rays of all pixels see at a state where nothing was known before: constants."""
+    """A `Sight` is what the rays of all pixels see at a state, without knowledge of a nearby state; it is constant."""
 
     state: State
     field: Field
-    closest: Closest  # of the rays of both images, left ones first
-    hits: Hits  # of the rays of the left image
+    closest: Closest  # closest points of the rays of both images, left ones first
+    hits: Hits  # hits of the rays of the left image
 
 
 class Linear(NamedTuple):
-    """Residuals of a term with their Jacobian in factors, N residuals to a row."""
+    """A `Linear` holds residuals of a term, N for each row, with their Jacobian in factors."""
 
     residual: Tensor  # (M, R, N)
     J_residual_inner: Tensor  # (M, R, N)
-    # (M, R, S) by the unknowns that the term sees, block after block, or (M, R, D) by all
+    # (M, R, S) by the unknowns that the term sees, block after block, or (M, R, D) by all unknowns
     J_inner_state: Tensor
-    where: Where  # the points at which they were taken
+    where: Where  # the points at which the residuals were taken
 
 
 class Evidence(Protocol):
-    """What is known of B cars before the first stage, of which each stage makes a term. It never changes."""
+    """`Evidence` is what is known of B cars before the first stage; each stage makes a term of it. It never changes."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the C columns of costs that its terms fill."""
+        """The names of the C columns of costs that the terms of this evidence fill."""
         ...
 
     def begin(self, stage: StageConfig, sight: Sight) -> Term:
-        """The term of a stage, with everything fixed that must not change meanwhile: pixel sets, counts, widths."""
+        """The term of a stage, with fixed pixel sets, counts and widths."""
         ...
 
     def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Self:
-        """The evidence of the cars where `keep` (B,) holds: `numbers` of them, as the host knows it."""
+        """The evidence of the cars where `keep` (B,) is true; the host knows their `numbers`."""
         ...
 
 
 class _FieldAlone:
-    """A name without a value on the class: that of each object counts."""
+    """`_FieldAlone` marks a name that has a value on each object but none on the class."""
 
     def __get__(self, term: object, kind: type) -> NoReturn:
         raise AttributeError(f"{kind.__name__} object has no value of this field")
 
 
 class Term(Protocol):
-    """One summand of the energy of B cars in a stage. Terms never change.
+    """A `Term` is one summand of the energy of B cars in a stage. Terms never change.
 
-    A term whose rows are the same in all stages is its own `Evidence`.
-    A subclass need not write what is here: a measurement of one column, whose rows are the same in all stages, may all
-    change, and look nowhere. Fields of a dataclass may stand for properties.
+    A term whose rows are equal in all stages is its own `Evidence`. The defaults suit a measurement with one column of
+    costs, whose rows are equal in all stages, can all change, and look nowhere; its class need not override them.
+    Fields of a dataclass may replace properties.
     """
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        # A dataclass takes what it inherits under the name of a field for its default, and could not set a property.
+        # A dataclass would use an inherited property as the default of its field, and could not set the property.
         for name in inspect.get_annotations(cls).keys() & vars(Term).keys():
             if inspect.getattr_static(cls, name) is vars(Term)[name]:
                 setattr(cls, name, _FieldAlone())
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the C columns of costs that it fills."""
+        """The names of the C columns of costs that the term fills."""
         ...
 
     @property
@@ -97,7 +97,7 @@ class Term(Protocol):
 
     @property
     def is_prior(self) -> bool:
-        """Whether it says what is known beforehand, and not what was measured."""
+        """Whether the term is prior knowledge and not a measurement."""
         return False
 
     @property
@@ -107,7 +107,7 @@ class Term(Protocol):
 
     @property
     def column(self) -> Tensor:
-        """Which (M,) of the names each block belongs to."""
+        """Index (M,) into the names of the column of each block."""
         return torch.zeros_like(self.blocks.owner)
 
     @property
@@ -117,76 +117,76 @@ class Term(Protocol):
 
     @property
     def information(self) -> Tensor:
-        """The same (M,) in the Fisher matrix, float64: residuals in standard deviations, not means."""
+        """Factor (M,) of each block in the Fisher matrix, float64; it counts standard deviations instead of means."""
         ...
 
     @property
     def row_weight(self) -> Tensor:
-        """Of single residuals (M, R, N); zero in empty places."""
+        """Weights (M, R, N) of single residuals; zero in empty places."""
         ...
 
     def begin(self, stage: StageConfig, sight: Sight) -> Term:
-        """The term of a stage, which for rows that are the same in all stages is the term itself."""
+        """The term of a stage; it is the term itself if the rows are equal in all stages."""
         return self
 
     def moving(self, sight: Sight, after_wider: bool) -> tuple[Self, Where, Tensor]:
-        """The rows that can change while the stage's iterations move the cars, where they look, and the others' cost
-        (B, C) in the columns of the term.
+        """Return the rows that can change during the iterations of a stage, where they look, and the cost of the rest.
 
-        `after_wider`: an earlier stage had a wider contour, so that this one has less to move.
+        The cost (B, C) of all other rows is in the columns of the term. If `after_wider` is true, an earlier stage had
+        a wider contour, so that less motion remains.
         """
         by_car = len(self.blocks.counts), len(self.names)
         return self, self.where(sight), torch.zeros(by_car, dtype=torch.float64, device=self.blocks.owner.device)
 
     def where(self, sight: Sight) -> Where:
-        """Where the rows look at a state at which every ray was marched."""
+        """Where the rows look at the state of a `Sight`, at which every ray was marched."""
         return ()
 
     def linear(self, field: Field, state: State, where: Where) -> Linear:
-        """Residuals with their hand-derived Jacobian, looking near `where`, which is that of a state nearby.
+        """Return residuals with their hand-derived Jacobian; rows look near `where`, which comes from a nearby state.
 
-        A user's term may do without it: `terms.derived` then differentiates its `residual`.
-        With gradients enabled all of it is differentiable, by the state and by whatever the term is made of.
+        A user's term may omit this method: `terms.derived` then differentiates its `residual`. With gradients enabled
+        the result is differentiable by the state and by all tensors of the term.
         """
         ...
 
     def residual(self, field: Field, state: State, where: Where) -> Tensor:
-        """Residuals (M, R, N) by themselves, of states next to the one whose `linear` gave `where`; differentiable."""
+        """Differentiable residuals (M, R, N) at a state close to the one whose `linear` gave `where`."""
         ...
 
     def norm(self, residual: Tensor) -> RobustValue:
-        """What residuals (M, R, N) cost."""
+        """The norm of residuals (M, R, N), with its weights."""
         ...
 
     def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Self:
-        """The rows of the cars where `keep` (B,) holds: `numbers` of them, as the host knows it."""
+        """The term of the cars where `keep` (B,) is true; the host knows their `numbers`."""
         ...
 
 
 class Part(NamedTuple):
-    """What the M blocks of a term add to the sums of their cars, float64 and not yet weighted."""
+    """A `Part` is what the M blocks of a term add to the sums of their cars, before weighting, float64."""
 
     cost: Tensor  # (M,)
-    products: Tensor  # (M, D + 1, D) the Gauss-Newton matrix and, as one more row, the gradient
-    information: Tensor  # (M, D, D) the matrix with the weights of the Fisher information; without `fisher` the other
+    products: Tensor  # (M, D + 1, D) the Gauss-Newton matrix and, as the last row, the gradient
+    information: Tensor  # (M, D, D) the Fisher matrix, or without `fisher` the Gauss-Newton matrix
     residual: Tensor  # (M, R, N)
-    where: Where  # the points at which they were taken
+    where: Where  # the points at which the residuals were taken
 
 
 def linear_of(term: Term, field: Field, state: State, where: Where) -> Linear:
-    """`term.linear` with a column for each unknown of the state, zeros by those that the term does not see."""
+    """`term.linear` with a column for each unknown of the state; columns of unseen unknowns are zero."""
     at = term.linear(field, state, where)
     return at._replace(J_inner_state=state.unknowns.placed(at.J_inner_state, term.sees))
 
 
 def part_of(term: Term, at: Linear, fisher: bool = True) -> Part:
-    """The sums over the rows of each block, from residuals and their Jacobian in factors.
+    """Sum over the rows of each block, from residuals and their Jacobian in factors.
 
-    Without `fisher` nobody asks for the information, and the Gauss-Newton matrix stands in its place.
+    Without `fisher` the information is unused, and the Gauss-Newton matrix takes its place.
     """
     norm = term.norm(at.residual)
     weight = term.row_weight
-    # All residuals of a row share one inner scalar, so their Jacobians are multiples of one: sum the multiples first.
+    # All residuals of a row share one inner scalar, so their Jacobians are multiples of one; the multiples are added.
     J, squared = at.J_residual_inner, at.J_residual_inner * at.J_residual_inner
     first = (weight * norm.gradient_weight * J).sum(dim=-1)
     second = (weight * norm.hessian_weight * squared).sum(dim=-1)
@@ -199,7 +199,7 @@ def part_of(term: Term, at: Linear, fisher: bool = True) -> Part:
 
 
 def part_of_rows(term: Term, residual: Tensor, J: Tensor, where: Where) -> Part:
-    """The same from residuals (M, R, N) and any Jacobian (M, R, N, D) of them."""
+    """Sums over the rows of each block, from residuals (M, R, N) and any Jacobian (M, R, N, D) of them."""
     norm, weight = term.norm(residual), term.row_weight
     first, second = (weight * w for w in (norm.gradient_weight, norm.hessian_weight))
     products = weighted_products(J.flatten(1, 2), first.flatten(1, 2), second.flatten(1, 2))
@@ -210,7 +210,7 @@ def _block_costs(weight: Tensor, norm: RobustValue) -> Tensor:
     return (weight * norm.rho).sum(dim=-1).to(torch.float64).sum(dim=1)
 
 
-# The sizes that vary from call to call, of the state, of the shapes, and of where rows look.
+# These axes of the state, of the shapes and of where rows look have sizes that vary from call to call.
 _SIZES = {
     "T_obj_cam": 0,
     "code": 0,
@@ -230,13 +230,13 @@ _SIZES = {
 
 
 def with_varying_blocks(term: Term) -> Term:
-    """The term with its number of blocks marked as what varies, for compiled code to hold for any; else as it is."""
+    """The term, with its number of blocks marked as variable if its code will be compiled."""
     if not will_compile():
         return term
     num_blocks = len(term.blocks.owner)
 
     def axes_of(tensor: Tensor) -> set[int]:
-        # Tables of one or two axes grow along the first, so do those of cars; what is in blocks along the last but one.
+        # Tensors in blocks grow along the last axis but one; other tensors, as tables of cars, along the first axis.
         is_in_blocks = tensor.ndim > 2 and tensor.shape[-2] == num_blocks
         return {tensor.ndim - 2 if is_in_blocks else 0} if tensor.ndim else set()
 
@@ -247,7 +247,7 @@ def with_varying_blocks(term: Term) -> Term:
 def parts_of(
     terms: tuple[Term, ...], field: Field, state: State, wheres: tuple[Where, ...], fisher: bool = True
 ) -> tuple[Part, ...]:
-    """All terms at a state, looking near the points given, with their hand-derived Jacobians."""
+    """The parts of all terms at a state, with hand-derived Jacobians; rows look near the points `wheres`."""
     ats = [linear_of(term, field, state, where) for term, where in zip(terms, wheres, strict=True)]
     return tuple(part_of(term, at, fisher) for term, at in zip(terms, ats, strict=True))
 
@@ -257,40 +257,40 @@ def weighted_products(
     gradient_weight: Tensor,  # (M, R)
     hessian_weight: Tensor,  # (M, R)
 ) -> Tensor:  # (M, D + 1, D)
-    """`sum w_H J^T J` of each block and, as one more row, `sum w_g J`; float64.
+    """Return `sum w_H J^T J` of each block and, as the last row, `sum w_g J`; float64.
 
-    The rows of a block are summed in their own precision, the blocks of a car in float64.
+    The rows of a block are summed in their own precision; the blocks of a car are summed in float64.
     """
     weighted = torch.cat([J * hessian_weight[..., None], gradient_weight[..., None]], dim=-1)
     return torch.bmm(weighted.mT, J).to(torch.float64)
 
 
 class Evaluation(NamedTuple):
-    """The energy of B cars at one state, float64, and where its rows looked."""
+    """An `Evaluation` is the energy of B cars at one state, float64, and where its rows looked."""
 
     cost: Tensor  # (B,)
     gradient: Tensor  # (B, D)
     hessian: Tensor  # (B, D, D) Gauss-Newton matrix
-    wheres: tuple[Where, ...]  # of each term
+    wheres: tuple[Where, ...]  # points at which each term looked
 
 
 class Figures(NamedTuple):
-    """The energy of B cars at one state, column by column of the T columns of its terms, float64."""
+    """`Figures` are the energy of B cars at one state, for each of the T columns of its terms, float64."""
 
     term_costs: Tensor  # (B, T)
     gradient: Tensor  # (B, T, D)
     hessian: Tensor  # (B, T, D, D)
     information: Tensor  # (B, T, D, D) Fisher matrix, up to one calibration factor
-    parts: tuple[Part, ...]  # of each term
+    parts: tuple[Part, ...]  # part of each term
 
     @property
     def cost(self) -> Tensor:
-        """Of all terms (B,)."""
+        """Cost (B,) of all terms together."""
         return self.term_costs.sum(dim=1)
 
 
 def summed(sums: CarSums, weight: Tensor, parts: Sequence[Part]) -> Evaluation:
-    """The evaluation that the blocks of all terms add up to, with weights (M,) of the blocks of all terms."""
+    """The evaluation that sums the blocks of all terms, with weights (M,) of these blocks."""
     products = sums.sum(torch.cat([part.products for part in parts]), weight)
     cost = sums.sum(torch.cat([part.cost for part in parts]), weight)
     return Evaluation(cost, products[:, -1], products[:, :-1], tuple(part.where for part in parts))
@@ -299,9 +299,9 @@ def summed(sums: CarSums, weight: Tensor, parts: Sequence[Part]) -> Evaluation:
 def by_autograd(
     terms: Sequence[Term], prior: ShapePrior, state: State, wheres: Sequence[Where]
 ) -> list[tuple[Tensor, Tensor]]:
-    """Residuals (M, R, N) of every term and their Jacobian (M, R, N, D) by forward-mode differentiation.
+    """Return residuals (M, R, N) of every term and their Jacobian (M, R, N, D) by forward-mode differentiation.
 
-    Each residual depends on one car only, so one tangent of `retract` moves all cars at once: D tangents, batched,
+    Each residual depends on one car only, so one tangent of `retract` moves all cars at once, and D batched tangents
     share one evaluation of the values. Where the rows look is a constant, as in the hand-derived form.
     """
 
