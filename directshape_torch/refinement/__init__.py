@@ -1,1 +1,1 @@
-"""The refinement of the cars of a call: their problem, by themselves and in tracks, and what is said of the end."""
+"""This package states the problem of the cars of a call, minimises it and judges the result."""

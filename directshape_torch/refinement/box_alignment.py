@@ -1,9 +1,10 @@
-"""The dense alignment of Stereo R-CNN (Li, Chen, Shen, CVPR 2019), a baseline: a box's depth by photometry alone.
+"""This baseline is the dense alignment of Stereo R-CNN (Li, Chen, Shen, CVPR 2019): only photometry sets the depth.
 
-The lower half of the box's near sides stands for the car's surface, for there the two are nearest to each other. It is
-moved in depth as a whole, every pixel by the same metres, to where the images agree best: first over a wide range of
-disparities, then over a narrow one. Dimensions and heading stay the detector's. Unlike theirs, pixels are those of the
-instance mask, and the norm is that of the photometric term.
+The lower half of the box's near sides stands for the car's surface, because box and surface are nearest to each other
+there. All pixels of this half are moved in depth by an equal number of metres, to where the images agree best. The
+search covers a wide range of disparities first and a narrow one afterwards. Dimensions and heading stay the detector's.
+Stereo R-CNN differs in two points: this module takes the pixels of the instance mask, and the norm of the photometric
+term.
 """
 
 from __future__ import annotations
@@ -31,9 +32,11 @@ from directshape_torch.status import Status
 from directshape_torch.terms.depth import Hits
 from directshape_torch.terms.photometric import Photometric, Surface
 
-# Range and step of each search: near cars may begin further away than the first one reaches.
+# These are the range and the step of each search. The wide search runs twice, because near cars may begin further away
+# than one search reaches.
 _ROUNDS_PX = ((3.0, 0.25), (3.0, 0.25), (0.5, 0.05))
-# Lower and upper corner of a box, and the top of its lower half, in units of its length, height and width.
+# These are the lower and the upper corner of a box, and the top of its lower half, in units of length, height and
+# width.
 _UNIT_BOX = (-0.5, -1.0, -0.5, 0.5, 0.0, 0.5)
 _TOP = -0.5
 
@@ -42,7 +45,8 @@ _TOP = -0.5
 def align_boxes(problem: CarProblem, initial: CarState, cars: CarBatch, came: RefinementResult) -> RefinementResult:
     """Move the detector's boxes of B cars along the viewing rays of their origins to the lowest photometric cost.
 
-    `came` is what is known of the cars beforehand. The status is `converged`, `no_match` where the cost has no
+    `came` holds what is known of the cars before the
+    call. The status of a car is `converged`, `no_match` where the cost has no
     valley in the last range, or `non_finite`.
     """
     state = initial
@@ -78,7 +82,7 @@ def box_hits(
     T_obj_cam: Tensor,  # (B, 4, 4)
     dimensions_hwl: Tensor,  # (B, 3) metres
 ) -> Hits:
-    """Where rays enter the boxes of their cars, of which the lower halves count."""
+    """The points where rays enter the boxes of their cars; only points on the lower halves are marked as found."""
     in_objects = rays.in_objects(T_obj_cam)
     size = dimensions_hwl.roll(1, dims=1)[rays.owner].mT[..., None]  # (3, M, 1) length, height, width
     in_unit_box = ObjectRays(*(x / size for x in in_objects))
@@ -93,7 +97,7 @@ def moved_costs(
     surface: Surface,
     moved_m: Tensor,  # (S, B)
 ) -> Tensor:
-    """Costs (B, S), float64, of the pixels of B cars, all of whose depths are changed by S amounts in turn."""
+    """Costs (B, S), float64, of B cars when the depths of all their pixels are changed by each of S amounts."""
     rows, owner = term.pixel_set.rows, term.blocks.owner
     sums, no_shift = CarSums.of(owner, len(term.cars)), torch.zeros_like(rows.rays.centre_cam[:, 0])
     everything = torch.ones_like(rows.pixel_weight)[None]
@@ -107,7 +111,7 @@ def moved_costs(
 
 
 def _begun(problem: CarProblem, state: CarState, cars: CarBatch) -> tuple[Photometric, Surface]:
-    """The photometric term with the pixels of the near sides, and these sides."""
+    """The photometric term with the pixels of the near sides, and the surface of these sides."""
     sight = problem.look(state)._replace(hits=_near_sides(problem, state, cars))
     term = problem.begin(-1, sight).photometric
     assert term is not None, "the problem of the method has this term alone"

@@ -1,8 +1,8 @@
-"""The photometric cost of a car over offsets of its disparity: is its state in the right valley, and is there another?
+"""The photometric cost over offsets of a car's disparity shows whether the state is in the right valley.
 
-One curve at the input and one at the end, with the same pixels, say how far the images pull each of them, how sharply,
-and whether a repeated texture offers a second place. The hits of a state are moved along their rays together, as if the
-whole visible surface had another disparity; shape and contour stay.
+One curve belongs to the input and one to the end of the refinement, and both use equal pixels. A curve shows how far
+and how sharply the images pull a state, and whether a repeated texture offers a second place. The hits of a state are
+moved along their rays together, as if the whole visible surface had another disparity. Shape and contour stay.
 """
 
 from __future__ import annotations
@@ -23,28 +23,31 @@ from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.photometric_rows import PhotometricRows, residuals_at
 from directshape_torch.terms.robust import huber
 
-# Two minima nearer than this are one with a dent.
+# Two minima nearer to each other than this count as one minimum with a dent.
 APART_PX = 0.75
-# A second minimum less than this factor above the first could be the true one.
+# A second minimum could be the true one if its cost is below this factor times the lowest cost.
 AMBIGUOUS_BELOW = 1.25
 MAX_PIXELS = 100
-"""Pixels of each car that a curve is made of by default: enough for its shape at half the time of all."""
+"""By default a curve is made of at most this many pixels of a car, which takes half the time of all."""
 _TINY = 1e-9
-# The noise of cameras alone lets two images of one surface differ by so many grey levels.
+# The noise of cameras alone lets two images of one surface differ by this many grey levels.
 _NOISE_GREY = 2.0
-# Residuals of several offsets at once: 1 MB in single precision, for what does not stay in the caches takes longer.
+# This many residuals are computed at once. They take 1 MB in single precision; what does not fit into the caches takes
+# longer.
 _RESIDUALS_AT_ONCE = 250_000
 
 
 class ProfileFigures(NamedTuple):
-    """What one curve says of each of B cars; NaN and False where there is no curve.
+    """These are the figures of one curve for each of B cars. They are NaN and False where there is no curve.
 
     Attributes:
-        offset_px: (B,) of the lowest cost, by the parabola through its neighbours; at an end of the range the end.
-        sigma_px: (B,) standard deviation of that offset, from the curvature there and the cost that is left; infinite
-            where the curve is flat, or falls to an end.
-        distinctness: (B,) cost of the best other minimum, at least 0.75 px away, over the lowest; infinite without one.
-        ambiguous: (B,) bool: the other minimum is nearly as low.
+        offset_px: (B,) offset of the lowest cost, by the parabola through its neighbours. If the lowest cost is at an
+            end of the range, this is that end.
+        sigma_px: (B,) standard deviation of `offset_px`, from the curvature at the minimum and the cost that is left.
+            It is infinite where the curve is flat or falls to an end.
+        distinctness: (B,) cost of the best other minimum, at least 0.75 px away, divided by the lowest cost. It is
+            infinite if there is no other minimum.
+        ambiguous: (B,) bool, whether the best other minimum is nearly as low.
     """
 
     offset_px: Tensor
@@ -55,15 +58,17 @@ class ProfileFigures(NamedTuple):
 
 @dataclass(frozen=True)
 class DisparityProfile(CarRecord):
-    """Photometric cost of B cars over n offsets of their disparity, with the pixels of the final stage.
+    """This is the photometric cost of B cars over n offsets of their disparity, with the pixels of the final stage.
 
     Attributes:
-        offsets_px: (n,) evenly spaced, full-resolution pixels; a positive one is nearer.
-        cost_before, cost_after: (B, n) cost at the input and at the end, of the photometric term without the factors of
-            single cars; NaN for cars without pixels, or that were not refined.
-        num_pixels: (B,) of the curves.
-        halves_apart: (B,) by how much the costs at the end of upper, lower, left and right half of the pixels fall
-            where each takes its own best disparity, sum of the logarithms. Pixels of one car have that in common.
+        offsets_px: (n,) evenly spaced offsets in pixels of the full resolution. A positive offset brings the car
+            nearer.
+        cost_before, cost_after: (B, n) cost of the photometric term at the input and at the end, without the factors of
+            single cars. It is NaN for cars without pixels and for cars that were not refined.
+        num_pixels: (B,) number of pixels of the curves.
+        halves_apart: (B,) how much the costs of the upper, lower, left and right half of the pixels fall at the end
+            when each half takes its own best disparity, as the sum of the logarithms of the ratios. Pixels of one car
+            have a common best disparity.
     """
 
     shared = frozenset({"offsets_px"})
@@ -75,7 +80,7 @@ class DisparityProfile(CarRecord):
     halves_apart: Annotated[Tensor, Dense("B")]
 
     def cost_at(self, offset_px: float) -> tuple[Tensor, Tensor]:
-        """Costs (B,) of both curves at the sample next to an offset."""
+        """Costs (B,) of both curves at the sample nearest to an offset."""
         column = (self.offsets_px - offset_px).abs().argmin(dim=0, keepdim=True)
         return self.cost_before.index_select(1, column)[:, 0], self.cost_after.index_select(1, column)[:, 0]
 
@@ -86,12 +91,12 @@ class DisparityProfile(CarRecord):
 
     @property
     def after(self) -> ProfileFigures:
-        """Figures of the curve at the end; a good fit has its minimum near 0 and no other that is as low."""
+        """Figures of the curve at the end; a good fit has one low minimum, near an offset of 0."""
         return profile_figures(self.offsets_px, self.cost_after, self.num_pixels)
 
 
 def profile_offsets(range_px: float = 3.0, step_px: float = 0.25) -> Tensor:
-    """Offsets (n,) from minus to plus the range, 0 in the middle, float64.
+    """Offsets (n,) from `-range_px` to `range_px` with 0 in the middle, float64.
 
     Raises:
         InputError: no positive range and step, or a range below two steps.
@@ -108,12 +113,14 @@ def _constant_offsets(_: torch.dtype, device: torch.device) -> Tensor:
 
 
 def default_offsets(like: Tensor) -> Tensor:
-    """`profile_offsets` on the device of a tensor; a copy, for results are their owners' to write to."""
+    """A copy of `profile_offsets` on the device of a tensor; the owner of a result may write to it."""
     return _constant_offsets(like).clone()
 
 
 def profile_figures(offsets_px: Tensor, cost: Tensor, num_pixels: Tensor) -> ProfileFigures:
-    """Figures of curves (B, n) at evenly spaced offsets (n,), 0 among them, each a mean over so many pixels (B,).
+    """Compute the figures of cost curves (B, n) at evenly spaced offsets (n,) that include 0.
+
+    Each cost is a mean over `num_pixels` (B,) pixels.
 
     Examples:
         >>> offsets = profile_offsets()
@@ -127,7 +134,7 @@ def profile_figures(offsets_px: Tensor, cost: Tensor, num_pixels: Tensor) -> Pro
     lowest = cost.gather(1, best[:, None])[:, 0]
     offset, sigma = _vertex(offsets_px, cost, best, num_pixels)
     other = _other_minimum(offsets_px, cost, best)
-    # Of a cost of zero as well, another that is as low is as low.
+    # If the lowest cost is zero and another minimum is zero too, their ratio counts as 1.
     distinctness = torch.where(other > lowest, other / lowest, torch.ones_like(lowest))
     nan = torch.full_like(lowest, torch.nan)
     offset, sigma, distinctness = (torch.where(known, x, nan) for x in (offset, sigma, distinctness))
@@ -135,9 +142,9 @@ def profile_figures(offsets_px: Tensor, cost: Tensor, num_pixels: Tensor) -> Pro
 
 
 def _vertex(offsets_px: Tensor, cost: Tensor, best: Tensor, num_pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Offset (B,) and its standard deviation (B,), by the parabola through the lowest cost and its neighbours.
+    """Find the offset (B,) and its standard deviation (B,) by the parabola through the lowest cost and its neighbours.
 
-    With a mean squared residual of twice the cost, `sigma^2 = 2 cost / (curvature num_pixels)`.
+    The mean squared residual is twice the cost, which gives `sigma^2 = 2 cost / (curvature num_pixels)`.
     """
     inner = best.clamp(1, cost.shape[1] - 2)
     left, here, right = cost.gather(1, torch.stack([inner - 1, inner, inner + 1], dim=1)).unbind(dim=1)
@@ -152,7 +159,7 @@ def _vertex(offsets_px: Tensor, cost: Tensor, best: Tensor, num_pixels: Tensor) 
 
 
 def _other_minimum(offsets_px: Tensor, cost: Tensor, best: Tensor) -> Tensor:
-    """Lowest local minimum (B,) that is not the lowest one; one at an end counts, infinite where there is none."""
+    """Cost (B,) of the second lowest local minimum; ends of the range count as minima, and infinity stands for none."""
     padded = torch.nn.functional.pad(cost, (1, 1), value=torch.inf)
     is_minimum = (cost <= padded[:, :-2]) & (cost <= padded[:, 2:])
     is_apart = (offsets_px - offsets_px[best][:, None]).abs() > APART_PX - 1e-6
@@ -169,9 +176,10 @@ def disparity_profile(
     offsets_px: Tensor | None = None,
     max_pixels: int = MAX_PIXELS,
 ) -> DisparityProfile:
-    """The curves of B cars, from the photometric term of a stage and the surface under its pixels at input and end.
+    """Compute the curves of B cars from the photometric term of a stage and the surface at the input and at the end.
 
-    Offsets (n,) are evenly spaced, 0 among them; of each car's pixels every second, third, ... if it has too many.
+    The offsets (n,) are evenly spaced and include 0. If a car has too many pixels, only every second, third, ... is
+    used.
     """
     offsets = default_offsets(like) if offsets_px is None else offsets_px
     nothing = DisparityProfile.nothing({"B": num_cars, "n": len(offsets)}, like, offsets_px=offsets)
@@ -185,7 +193,8 @@ def disparity_profile(
         for x, y in ((before.depth, after.depth), (before.on_surface, after.on_surface))
     )
     per_px = -1 / (term.cars.K_right[:, 0, 0] * term.cars.T_right_cam[:, 0, 3])
-    # A few offsets at a time where the pixels are many, so that memory stays that of the other evaluations.
+    # If there are many pixels, the offsets are evaluated in parts, so that this needs no more memory than other
+    # evaluations.
     num_parts = -(-rows.neighbour_weight.numel() * 2 * len(offsets) // _RESIDUALS_AT_ONCE)
     parts = _quarters(rows)
     quarters = torch.cat(
@@ -207,7 +216,7 @@ def disparity_profile(
 
 
 def _quarters(rows: PhotometricRows) -> Tensor:
-    """Which pixels (4, B, R) are in the upper left, upper right, lower left and lower right quarter of their car's."""
+    """Whether pixels (4, B, R) lie in the upper left, upper right, lower left, lower right quarter of their car."""
     counts = (rows.pixel_weight > 0).to(rows.pixel_weight.dtype)
     uv = rows.rays.ray_cam[:2] / rows.rays.ray_cam[2]
     middle = (uv * counts).sum(dim=2, keepdim=True) / counts.sum(dim=1).clamp_min(1)[:, None]
@@ -216,7 +225,7 @@ def _quarters(rows: PhotometricRows) -> Tensor:
 
 
 def _halves_apart(quarters: Tensor, offsets_px: Tensor, of_noise: Tensor) -> Tensor:
-    """`DisparityProfile.halves_apart` from costs (4, n, B) and what noise costs at least (B,)."""
+    """`DisparityProfile.halves_apart` from the costs of quarters (4, n, B) and the cost of camera noise (B,)."""
     upper_left, upper_right, lower_left, lower_right = quarters
     halves = torch.stack(
         [upper_left + upper_right, lower_left + lower_right, upper_left + lower_left, upper_right + lower_right]
@@ -227,9 +236,10 @@ def _halves_apart(quarters: Tensor, offsets_px: Tensor, of_noise: Tensor) -> Ten
 
 
 def _thinned(term: Photometric, max_pixels: int) -> tuple[PhotometricRows, Tensor]:
-    """Every second, third, ... pixel of each car, one block of R places a car; and their places (B, R) in the set.
+    """Take every second, third, ... pixel of each car, and return these pixels and their places (B, R) in the pixel
+    set.
 
-    A table rather than a list: how many pixels each car has, the host need not know.
+    Every car has one block of R places, so that the host does not have to know how many pixels each car has.
     """
     fixed, num_cars = term.pixel_set, len(term.cars)
     sums = CarSums.of(fixed.blocks.owner, num_cars)
@@ -237,7 +247,7 @@ def _thinned(term: Photometric, max_pixels: int) -> tuple[PhotometricRows, Tenso
     number = torch.arange(min(max_pixels, fixed.filled.numel()), device=counts.device)
     stride = (counts + max_pixels - 1) // max_pixels
     step = number * stride[:, None]
-    # An empty place repeats the car's last pixel, which is not counted: another car's may be NaN.
+    # An empty place repeats the car's last pixel with weight 0. A pixel of another car could be NaN.
     first = sums.first.clamp_max(len(fixed.filled) - 1)
     place = first[:, None] * fixed.filled.shape[1] + step.minimum((counts - 1).clamp_min(0)[:, None])
     rows = fixed.rows
@@ -265,7 +275,7 @@ def shifted_costs(
     per_px: Tensor,  # (B,) inverse depth that a pixel of disparity is worth
     offsets_px: Tensor,  # (n,)
 ) -> Tensor:
-    """Costs (Q, S, n, B), float64, of parts of a row of pixels of each car, with surfaces moved by disparities."""
+    """Costs (Q, S, n, B), float64, of Q parts of the pixels of each car, with S surfaces moved by n disparities."""
     inverse = 1 / depth[:, None] + offsets_px[:, None, None] * per_px[:, None]
     residual, comparable = residuals_at(rows, 1 / inverse)
     usable = on_surface[:, None] & comparable & (inverse > 0)

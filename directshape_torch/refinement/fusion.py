@@ -1,8 +1,9 @@
-"""The box that the images and the detector give together, each counting by what it is known to be off by.
+"""This module combines the box of the images with the detector's box and weighs both by their known errors.
 
-A refinement says where the images have a car, the detections of a run how far such results and their boxes lie apart
-(`rig.detector_noise`). With the standard deviations of both the most probable box lies between them: a guess moves to
-where the images have it, a LiDAR box stays. Derivation: docs/derivations/fusion.md.
+A refinement gives the box of a car in the images. The detections of a run show how far the refined boxes and the
+detector's boxes are apart (`rig.detector_noise`). The standard deviations of both give the most probable box, which
+lies between them: a rough guess moves to the box of the images, and a LiDAR box stays. The derivation is in
+docs/derivations/fusion.md.
 """
 
 from __future__ import annotations
@@ -28,26 +29,31 @@ if TYPE_CHECKING:
     from directshape_torch.scene import Detections
 
 UNKNOWN_DETECTOR = torch.tensor([0.0260, 0.1558, 0.0779, 0.2078, 0.70, 0.16, 0.16], dtype=torch.float64)
-"""What detectors are off by of which nothing is known: `rig.detector_noise.detector_sigmas` without results."""
+"""These are the standard deviations of a detector of which nothing is known.
+
+`rig.detector_noise.detector_sigmas` gives them if it has no results.
+"""
 
 _RIDGE = 1e-9
 
 
 @dataclass(frozen=True)
 class DetectorComparison(CarRecord):
-    """Where B refined cars have their box and where the detector had it, columns `CAR_QUANTITIES`, metres.
+    """This compares the boxes of B refined cars with the detector's boxes, in columns `CAR_QUANTITIES`, metres.
 
-    There are NaN for cars that were not refined, but for `distance_in_sigmas`, which refused results keep.
+    The figures are NaN for cars that were not refined. Only `distance_in_sigmas` is kept for refused results.
 
     Attributes:
-        distance: (B,) of the images' box along the ground, metres.
-        difference: (B, 7) the detector's less the images'; headings modulo half a turn. NaN too for views of a track.
-        sigma_images: (B, 7) standard deviations of what the images say.
-        gain: (B, 7, 7) the most probable box less the images' is `gain @ difference`; zeros where boxes are not
-            brought together.
-        covariance: (B, 7, 7) of the most probable box; for views of a track of the images' box, which is returned.
-        distance_in_sigmas: (B,) between both boxes, in the standard deviations of both; of seven quantities that are
-            as they should be it is about 2.6. NaN where boxes are not brought together.
+        distance: (B,) distance of the images' box along the ground, metres.
+        difference: (B, 7) the detector's box minus the images' box, with headings modulo half a turn. It is also NaN
+            for views of a track.
+        sigma_images: (B, 7) standard deviations of the images' box.
+        gain: (B, 7, 7) `gain @ difference` is the most probable box minus the images' box. It is zero where boxes are
+            not combined.
+        covariance: (B, 7, 7) covariance of the most probable box. Views of a track return the images' box, so for them
+            it is the covariance of that box.
+        distance_in_sigmas: (B,) distance between both boxes in the standard deviations of both. It is about 2.6 if all
+            seven quantities behave as expected, and NaN where boxes are not combined.
     """
 
     distance: Annotated[Tensor, Dense("B")]
@@ -62,7 +68,7 @@ def noise_of_boxes(
     sigmas: Tensor,  # (7,) of `RigEstimate.detector_sigmas`
     T_cam_obj: Tensor,  # (B, 4, 4)
 ) -> Tensor:  # (B, 7)
-    """Standard deviations of a detector's boxes in `CAR_QUANTITIES`, metres: that of the depth grows with distance."""
+    """Standard deviations of a detector's boxes in `CAR_QUANTITIES`, metres; depth errors grow with distance."""
     origin = T_cam_obj.detach()[:, :3, 3].double()
     units = torch.ones(len(origin), len(sigmas), dtype=origin.dtype, device=origin.device)
     units[:, 0] = torch.hypot(origin[:, 0], origin[:, 2])
@@ -74,7 +80,7 @@ def level_boxes(
     T: Tensor,  # (B, 4, 4) object to any frame
     code: Tensor,  # (B, K)
 ) -> tuple[Tensor, Tensor]:  # (B, 3), (B, 3)
-    """The middles of the bottom faces of the boxes about zero levels, in that frame, and height, width, length."""
+    """Bottom centres of the boxes around zero levels, in the target frame of `T`, and height, width, length."""
     lower, upper = zero_level_extents(prior.values(code), prior.origin, prior.spacing_m).unbind(1)
     length, height, width = (upper - lower).unbind(-1)
     middle = 0.5 * (lower + upper)
@@ -84,7 +90,7 @@ def level_boxes(
 
 @torch.no_grad()
 def compared(result: RefinementResult, cars: CarBatch, image_noise: ImageNoise) -> DetectorComparison:
-    """The boxes of the images of B refined cars beside those of their detector."""
+    """Compare the images' boxes of B refined cars with the detector's boxes."""
     origin = result.T_cam_obj[:, :3, 3].double()
     J = quantities_jacobian(result.prior, _state(result))
     of_images = image_noise.covariance(J @ result.covariance @ J.mT)
@@ -94,7 +100,7 @@ def compared(result: RefinementResult, cars: CarBatch, image_noise: ImageNoise) 
     if cars.detector_noise is not None:
         of_detector = torch.diag_embed(cars.detector_noise.to(of_images) ** 2)
         of_both = of_images + of_detector
-        # Both are symmetric, so that the gain is the transpose of what solves for the covariance.
+        # Both covariances are symmetric, so the gain is the transpose of the solution of `of_both @ X = of_images`.
         gain = torch.linalg.solve_ex(of_both, of_images)[0].mT
         weighed = torch.linalg.solve_ex(of_both, difference[:, :, None])[0]
         distance_in_sigmas = (difference[:, None] @ weighed)[:, 0, 0].sqrt()
@@ -112,7 +118,7 @@ def compared(result: RefinementResult, cars: CarBatch, image_noise: ImageNoise) 
 
 @torch.no_grad()
 def chances(result: RefinementResult, comparison: DetectorComparison, brings_together: bool) -> tuple[Tensor, Tensor]:
-    """`trust.probabilities` of the boxes that will be returned: the most probable ones, or those of the images."""
+    """`trust.probabilities` of the boxes that will be returned: the most probable boxes, or the images' boxes."""
     axes = viewing_axes(result.T_cam_obj[:, :3, 3].double())
     length = axes @ result.T_cam_obj[:, :3, :1].double()
     moved = (comparison.gain @ comparison.difference[:, :, None])[:, :, 0]
@@ -123,9 +129,9 @@ def chances(result: RefinementResult, comparison: DetectorComparison, brings_tog
 
 
 def fused(result: RefinementResult, detections: Detections) -> RefinementResult:
-    """The result with the boxes of the images and the detections moved to the most probable ones between them.
+    """The result with the images' boxes moved to the most probable boxes between them and the detections.
 
-    Views of a track stay: they have each other.
+    Views of a track keep the images' boxes, because the views already support one another.
     """
     gains = result.comparison.gain
     known = gains.isfinite().flatten(1).all(dim=1) & gains.flatten(1).any(dim=1)
@@ -136,7 +142,7 @@ def fused(result: RefinementResult, detections: Detections) -> RefinementResult:
     difference = _difference(own, *boxes)
     with torch.no_grad():
         J = quantities_jacobian(own.prior, _state(own))
-    # The first step is linear, which sizes in the code are not; the second one takes what is left.
+    # The first step is linear, but sizes are not linear in the code. The second step corrects what is left.
     target = (gain @ difference[..., None])[..., 0]
     state = _state(own)
     unknowns = state.unknowns
@@ -148,7 +154,7 @@ def fused(result: RefinementResult, detections: Detections) -> RefinementResult:
 
 
 def _least_step(unknowns: Unknowns, J: Tensor, change: Tensor) -> Tensor:
-    """The least step (R, D) of the unknowns that changes the quantities by so much (R, 7).
+    """The least step (R, D) of the unknowns that changes the quantities by `change` (R, 7).
 
     The pose changes place and heading; the shape, whose unit is its own standard deviation, changes the sizes.
     """
@@ -171,12 +177,12 @@ def _at(result: RefinementResult, state: CarState) -> RefinementResult:
 
 
 def _difference(result: RefinementResult, T_detector: Tensor, hwl: Tensor) -> Tensor:
-    """The boxes of the detector less those of the result, (B, 7) in `CAR_QUANTITIES`, float64."""
+    """The detector's boxes minus the result's boxes, (B, 7) in `CAR_QUANTITIES`, float64."""
     bottom, own_hwl = level_boxes(result.prior, result.T_cam_obj, result.code)
     axes = viewing_axes(result.T_cam_obj[:, :3, 3].detach())
     along, across, down = (axes @ (T_detector[:, :3, 3] - bottom)[..., None])[..., 0].unbind(dim=1)
     turned = rotation_y_from_pose(T_detector) - rotation_y_from_pose(result.T_cam_obj)
-    # Modulo half a turn: what of a car is its front the detector says alone.
+    # The heading is taken modulo half a turn, because only the detector knows which end of a car is its front.
     heading = 0.5 * torch.atan2(torch.sin(2 * turned), torch.cos(2 * turned))
     height, width, length = (hwl - own_hwl).unbind(dim=1)
     return torch.stack([along, across, -down, HEADING_LEVER_M * heading, length, width, height], dim=1).double()

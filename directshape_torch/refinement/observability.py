@@ -1,4 +1,4 @@
-"""Which directions a view does not show, in numbers and in words: what the Fisher information at the end says."""
+"""This module tells, from the Fisher information at the end, which directions a view does not show."""
 
 from __future__ import annotations
 
@@ -18,30 +18,31 @@ from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.state.unknowns import State
 
 CAR_QUANTITIES = ("depth", "sideways position", "height above ground", "heading", "length", "width", "height")
-"""The quantities (7) that a direction is made of; all in metres.
+"""These are the seven quantities that a direction is made of, all in metres.
 
-Depth is the distance from the camera along the ground and grows away from it, the sideways position grows to the
-camera's right, and the heading counts as the way of the car's end as it turns: radians times `HEADING_LEVER_M`.
+The depth is the distance from the camera along the ground. The sideways position grows to the camera's right. The
+heading counts as the way that the car's end moves when the car turns: radians times `HEADING_LEVER_M`.
 """
 
 HEADING_LEVER_M = 2.0
-"""Half the length of a typical car."""
+"""This is half the length of a typical car."""
 
-# Partners below this share of the largest one are not worth a word.
+# Parts of a direction below this share of its largest part are not named.
 _NAMED_SHARE = 0.2
-# What nothing shows at all would have an infinite sigma: 100 m, radians and standard deviations stand for it.
+# An unknown that the images do not show at all would have an infinite sigma. This value replaces it, in metres, radians
+# or standard deviations.
 _BLIND_SIGMA = 100.0
 
 
 @dataclass(frozen=True)
 class Observability(CarRecord):
-    """What the images say of B cars without any prior, NaN where they were not refined.
+    """This is what the images say of B cars without any prior. It is NaN for cars that were not refined.
 
     Attributes:
-        sigmas_m: (B, 7) standard deviations along the principal directions, the weakest direction first; in a result
-            scaled by the calibrated factor of the depth.
-        directions: (B, 7, 7) unit vectors, row i that of sigma i, columns `CAR_QUANTITIES`.
-        viewing_angle_rad: (B,) KITTI's alpha of the car, which says from where it is seen.
+        sigmas_m: (B, 7) standard deviations along the principal directions, the weakest direction first. In a result
+            they are scaled by the calibrated factor of the depth.
+        directions: (B, 7, 7) unit vectors: row i belongs to sigma i, the columns are `CAR_QUANTITIES`.
+        viewing_angle_rad: (B,) KITTI's alpha, which says from which side the car is seen.
     """
 
     sigmas_m: Annotated[Tensor, Dense("B", 7)]
@@ -49,7 +50,7 @@ class Observability(CarRecord):
     viewing_angle_rad: Annotated[Tensor, Dense("B")]
 
     def words(self) -> list[str]:
-        """The weakest direction of each car, largest part first; empty for cars that were not refined.
+        """Describe the weakest direction of each car, largest part first; cars that were not refined get an empty text.
 
         Examples:
             >>> direction = torch.tensor([0.45, 0.0, 0.0, 0.0, 0.89, 0.0, 0.0]).expand(1, 7, 7)
@@ -64,7 +65,7 @@ class Observability(CarRecord):
 
 
 def view_in_words(alpha_rad: float) -> str:
-    """From where a car is seen at KITTI's observation angle, in steps of 45 degrees.
+    """Say from which side a car is seen at KITTI's observation angle, in steps of 45 degrees.
 
     Examples:
         >>> [view_in_words(math.radians(a)) for a in (-90, -50, 0, 90)]
@@ -79,7 +80,7 @@ def view_in_words(alpha_rad: float) -> str:
 
 
 def direction_in_words(direction: Sequence[float]) -> str:
-    """The largest parts of a direction (7,); a minus says that the one falls as the other grows."""
+    """The largest parts of a direction (7,); a minus means that one part falls as the other grows."""
     order = sorted(range(len(direction)), key=lambda i: -abs(direction[i]))
     first = direction[order[0]]
     named = [i for i in order if abs(direction[i] / first) >= _NAMED_SHARE][:3]
@@ -91,10 +92,11 @@ def direction_in_words(direction: Sequence[float]) -> str:
 
 
 def covariance_of(fisher: Tensor) -> Tensor:
-    """Inverse Fisher information (B, D, D) in the tangent of the state, without damping; NaN where it is singular.
+    """Invert the Fisher information (B, D, D) in the tangent of the state, without damping; NaN stands for a singular
+    one.
 
-    Silhouette pixels count with weight 1 (not the solver's 1/r), sums run over effective pixels (not means). It is
-    uncalibrated: multiply by the s^2 fitted on data with ground truth.
+    Silhouette pixels count with weight 1 (not the solver's 1/r), and the information is a sum over effective pixels
+    (not a mean). The covariance is uncalibrated: multiply it by the s^2 fitted on data with ground truth.
     """
     finite = fisher.flatten(1).isfinite().all(1)
     identity = torch.eye(fisher.shape[-1], dtype=fisher.dtype, device=fisher.device)
@@ -105,9 +107,9 @@ def covariance_of(fisher: Tensor) -> Tensor:
 
 
 def without_offset(information: Tensor, kept: slice) -> Tensor:
-    """The information on the first unknowns, `kept`, whatever the others are, from that on all (B, D, D).
+    """Marginalise the information (B, D, D) on all unknowns to the first unknowns, `kept`.
 
-    Schur's complement; an offset of which nothing is known has nothing to share.
+    This is Schur's complement. An offset without any information changes nothing.
     """
     others = slice(kept.stop, None)
     of_others = information.diagonal(dim1=1, dim2=2)[:, None, others]
@@ -119,21 +121,23 @@ def covariance_xyz_yaw(
     covariance: Tensor,  # (B, 7, 7) of `CAR_QUANTITIES`
     location: Tensor,  # (B, 3) of the cars, for their viewing rays
 ) -> Tensor:
-    """Covariance (B, 4, 4) of x, y, z along the camera's (and reference frame's) axes and of `rotation_y`: metres and
-    radians."""
-    # Along the ray and across it on the ground; the height grows against y.
+    """Covariance (B, 4, 4) of x, y, z along the axes of the camera and of `rotation_y`, in metres and radians.
+
+    The axes of the reference frame are parallel to the camera's.
+    """
+    # Depth and sideways position lie along the viewing ray and across it on the ground. The height grows against y.
     J = torch.nn.functional.pad(_towards(location.to(covariance)).mT, (0, 1, 0, 1))
     J[:, 3, 3] = 1 / HEADING_LEVER_M
     return J @ covariance[:, :4, :4] @ J.mT
 
 
 def _towards(location: Tensor) -> Tensor:
-    """The directions (B, 3, 3), rows, in which depth, sideways position and height of cars grow."""
+    """The directions (B, 3, 3), as rows, in which depth, sideways position and height of cars grow."""
     return viewing_axes(location) * constant_like((1.0, 1.0, -1.0), location)[:, None]
 
 
 def observability_of(prior: ShapePrior, state: State, seen: Tensor | None) -> Observability:
-    """Principal directions of the car's quantities under the information (B, D, D) of the terms that are no priors."""
+    """Principal directions of the car's quantities, given the information (B, D, D) of all terms except the priors."""
     T_cam_obj = se3.inverse(state.T_obj_cam)
     alpha = alpha_from_kitti(T_cam_obj[:, :3, 3], rotation_y_from_pose(T_cam_obj)).to(torch.float64)
     if seen is None:
@@ -143,9 +147,10 @@ def observability_of(prior: ShapePrior, state: State, seen: Tensor | None) -> Ob
 
 
 def quantities_jacobian(prior: ShapePrior, state: State) -> Tensor:
-    """J (B, 7, D) of `CAR_QUANTITIES` by the tangent `(v, omega, dcode)` of the state.
+    """Compute the Jacobian (B, 7, D) of `CAR_QUANTITIES` by the tangent `(v, omega, dcode)` of the state.
 
-    The object origin, in the middle of the footprint, moves by `-R_cam_obj v`; `rotation_y` by `-R_cam_obj[1] omega`.
+    The object origin, in the middle of the footprint, moves by `-R_cam_obj v`. `rotation_y` changes by `-R_cam_obj[1]
+    omega`.
     """
     T_cam_obj = se3.inverse(state.T_obj_cam).to(torch.float64)
     R_cam_obj = T_cam_obj[:, :3, :3]
@@ -158,7 +163,7 @@ def quantities_jacobian(prior: ShapePrior, state: State) -> Tensor:
 
 
 def _principal(information: Tensor, J: Tensor) -> tuple[Tensor, Tensor]:
-    """Standard deviations (B, 7), falling, and directions (B, 7, 7), rows, of J (B, 7, D) times the unknowns."""
+    """Falling standard deviations (B, 7) and directions (B, 7, 7), as rows, of J (B, 7, D) times the unknowns."""
     finite = torch.cat([information, J], dim=1).flatten(1).isfinite().all(1)
     identity = torch.eye(information.shape[-1], dtype=information.dtype, device=information.device)
     information = torch.where(finite[:, None, None], information, 0.0) + identity / _BLIND_SIGMA**2
@@ -166,7 +171,7 @@ def _principal(information: Tensor, J: Tensor) -> tuple[Tensor, Tensor]:
     half = torch.linalg.solve_triangular(torch.linalg.cholesky_ex(information)[0], J.mT, upper=False)
     variances, vectors = torch.linalg.eigh(half.mT @ half)
     directions = vectors.mT.flip(1)
-    # The sign of a direction means nothing: its largest part grows.
+    # The sign of a direction has no meaning, so its largest part is made positive.
     largest = directions.gather(2, directions.abs().argmax(2, keepdim=True))
     sigmas = torch.where(finite[:, None], variances.flip(1).clamp_min(0).sqrt(), torch.nan)
     return sigmas, torch.where(finite[:, None, None], directions * largest.sign(), torch.nan)

@@ -1,4 +1,4 @@
-"""How the result of a call is made: cars as they came, what a minimisation says of them, and whether to believe it."""
+"""This module makes the result of a call from the input and the minimum, and decides which cars to trust."""
 
 from __future__ import annotations
 
@@ -39,25 +39,26 @@ from directshape_torch.terms.priors import RIG_WEIGHT
 from directshape_torch.terms.term import Evaluation, Figures
 
 _REFUSED = (Status.not_trusted, Status.mask_missed, Status.no_match, Status.depth_unknown, Status.no_car)
-# Nine in ten cars whose cost settled promise less than this share of it.
+# A further step promises less than this share of the cost for nine in ten cars whose cost has settled.
 _SETTLED_SHARE = 0.005
-# Of 2300 rendered cars one has less, and boxes at half or twice the true depth have 0.62 at most.
+# One of 2300 rendered cars has a lower IoU. Boxes at half or twice the true depth have 0.62 at most.
 _LEAST_MASK_IOU = 0.65
-# Of these cars at least 0.68 of the pixels could be compared.
+# At least 0.68 of the pixels of each of the 2300 rendered cars could be compared.
 _LEAST_MATCHED_SHARE = 0.1
-# The pixels of a car that is there have their best disparity where it ended, and know it to this many pixels. Most
-# boxes and masks that are laid on other images fail in this (scripts/calibrate_trust.py, column "elsewhere").
+# If a car is there, its pixels have their best disparity where the refinement ended, with at most this standard
+# deviation in pixels. Most boxes and masks that are laid on other images fail this test (scripts/calibrate_trust.py,
+# column "elsewhere").
 _LARGEST_OFFSET_SIGMA_PX = 0.5
-# A mask whose car is there with less probability rather shows another car or none.
+# If a car is there with a lower probability, its mask more likely shows another car or none.
 _LEAST_IS_THERE = 0.5
-# Sigma along the viewing ray over the depth; of these cars at most 0.1.
+# This limits sigma along the viewing ray divided by the depth. It is at most 0.1 for the 2300 rendered cars.
 _LARGEST_DEPTH_SHARE = 0.2
 
 
 def as_they_came(
     prior: ShapePrior, frames: FrameBatch, detections: Detections, status_code: Tensor, term_names: tuple[str, ...]
 ) -> RefinementResult:
-    """The result of B cars of which nothing is known but what they came with, and the statuses (B,) that say so."""
+    """The result of B cars of which only the input and the statuses (B,) are known."""
     count, T_cam_obj = len(detections), detections.T_cam_obj.clone()
     offsets = default_offsets(T_cam_obj)
     sizes: dict[int | str, int] = {
@@ -76,7 +77,7 @@ def as_they_came(
         iterations=torch.zeros_like(status_code),
         term_names=term_names,
         profile=DisparityProfile.nothing(sizes, T_cam_obj, offsets_px=offsets),
-        # The caller may reuse the tensor for the next call.
+        # The result holds a copy, because the caller may reuse the tensor for the next call.
         input_dimensions_hwl=detections.dimensions_hwl.clone(),
         ground_source=_ground_sources(frames, detections),
         t_cam_ref=frames.camera.t_cam_ref[detections.frame_index],
@@ -85,7 +86,7 @@ def as_they_came(
 
 
 def _ground_sources(frames: FrameBatch, detections: Detections) -> tuple[str, ...]:
-    """Where the plane of each car's frame came from; which frame that is the host asks only where it matters."""
+    """The source of the ground plane of each car; frame numbers are read from the device only if sources differ."""
     sources = frames.ground.source
     if len(set(sources)) == 1:
         return sources[:1] * len(detections)
@@ -93,9 +94,9 @@ def _ground_sources(frames: FrameBatch, detections: Detections) -> tuple[str, ..
 
 
 def going_on(result: RefinementResult, rows: Tensor, later: RefinementResult) -> RefinementResult:
-    """The result with what a later minimisation says of the cars `rows` (R,), ascending.
+    """The result with what a later minimisation says of the cars `rows` (R,), which ascend.
 
-    Terms that the earlier one did not have have cost the others nothing.
+    Terms that only the later minimisation has get a cost of 0 for the other cars.
     """
     place = torch.tensor([later.term_names.index(name) for name in result.term_names], device=rows.device)
     before, after = (
@@ -110,10 +111,10 @@ def going_on(result: RefinementResult, rows: Tensor, later: RefinementResult) ->
 
 
 def at_states(result: RefinementResult, state: State) -> RefinementResult:
-    """The result at its final states; what is said of a car that is not there is not known."""
+    """The result at its final states; figures of cars that were not refined become NaN, except for refused cars."""
     status, refined = result.status_code, result.refined
     figures_known = refined | torch.stack([status == each.code for each in _REFUSED]).any(dim=0)
-    # The input pose is returned to the bit for cars that were not refined, not inverted twice.
+    # Cars that were not refined get exactly their input pose. Two inversions would change its last bits.
     T_cam_obj = torch.where(refined[:, None, None], se3.inverse(state.T_obj_cam), result.T_cam_obj)
     return replace(
         result,
@@ -134,16 +135,16 @@ def at_states(result: RefinementResult, state: State) -> RefinementResult:
 def outcome_of(
     problem: CarProblem, minimum: Minimum[AnyState], cars: CarBatch, came: RefinementResult
 ) -> RefinementResult:
-    """What `came` becomes at a minimum: costs, covariance, quality, observability and profile.
+    """The result `came` with costs, covariance, quality, observability and profile of a minimum.
 
-    All of them where the iterations ended; cars that the solver gave their input back show nothing of it in a result
-    but their costs.
+    All figures belong to the states where the iterations ended. For cars that get their input back a result keeps only
+    the costs of the input.
     """
     end, refined = minimum.end, is_refined(minimum.status)
     stage: CarStage = minimum.stage
     before, after = minimum.before, _of_calibrated_rig(problem, minimum.after)
     kept = end.unknowns.span(POSE, CODE)
-    # What the other views of a track say of its shape.
+    # The other views of a track add what they say of its shape.
     information = problem.sharing.with_others(after.information.sum(dim=1), refined)
     covariance = covariance_of(information)[:, kept, kept] + _of_field(end, cars)
     at_input, at_end = (None if at is None else at.where for at in map(stage.photometric_part, (before, after)))
@@ -160,13 +161,13 @@ def outcome_of(
         cost_before=before.term_costs,
         cost_after=torch.where(refined[:, None], after.term_costs, before.term_costs),
         covariance=covariance,
-        # The directions are mostly those of the depth, so its factor brings them to size.
+        # The weak directions consist mostly of depth, so the factor of the depth calibrates them.
         observability=replace(unseen, sigmas_m=_depth_factor() * unseen.sigmas_m),
         profile=disparity_profile(stage.photometric, at_input, at_end, len(cars), end.code),
     )
     of_images = _at_end(found, end)
     comparison = compared(of_images, cars, bundled_trust_model().image_noise)
-    # Views of a track are not brought together with their detections.
+    # Views of a track are not combined with their detections.
     chance = chances(of_images, comparison, brings_together=problem.sharing is INDEPENDENT)
     apart, distance = found.profile.halves_apart, comparison.distance_in_sigmas
     quality = fit_quality(stage, after, minimum.seen_end, apart, distance, chance)
@@ -174,9 +175,9 @@ def outcome_of(
 
 
 def of_views_of_tracks(found: RefinementResult, end: State, cars: CarBatch) -> RefinementResult:
-    """The result of views of a track with what is known of the images' boxes, which they keep."""
+    """The result of views of a track, whose comparison is for the images' boxes, because views keep these."""
     alone = compared(_at_end(found, end), replace(cars, detector_noise=None), bundled_trust_model().image_noise)
-    # What the detector is off by is learnt from cars that are by themselves.
+    # The errors of the detector are learnt only from cars that are in no track.
     nothing, distance = torch.full_like(alone.difference, torch.nan), found.comparison.distance_in_sigmas
     return _placed(replace(found, comparison=replace(alone, difference=nothing, distance_in_sigmas=distance)), end)
 
@@ -194,12 +195,12 @@ def _at_end(found: RefinementResult, end: State) -> RefinementResult:
 
 
 def _depth_factor() -> float:
-    """What brings the uncalibrated standard deviations of the depth to size."""
+    """The factor that calibrates the standard deviations of the depth."""
     return bundled_trust_model().image_noise.factors[0]
 
 
 def _of_field(end: State, cars: CarBatch) -> Tensor:
-    """What the covariance (B, 6 + K, 6 + K) owes to the field, whose error moves a car along its viewing ray."""
+    """The part of the covariance (B, 6 + K, 6 + K) from the field, whose error moves a car along its viewing ray."""
     origin = se3.inverse(end.T_obj_cam)[:, :3, 3]
     disparity = cars.focal_baseline / origin[:, 2]
     shift_cam = origin * (cars.field_sigma_px / disparity)[:, None]
@@ -210,7 +211,7 @@ def _of_field(end: State, cars: CarBatch) -> Tensor:
 
 
 def _of_calibrated_rig(problem: CarProblem, figures: Figures) -> Figures:
-    """The rig's part of the information in units that the calibration of depth brings to the sigma that was given."""
+    """The figures with the rig's information scaled so that the depth's calibration gives the sigma of the caller."""
     if "rig" not in problem.term_names:
         return figures
     factor = torch.ones_like(figures.term_costs)
@@ -221,18 +222,18 @@ def _of_calibrated_rig(problem: CarProblem, figures: Figures) -> Figures:
 def judged(
     minimum: Minimum[AnyState], initial: AnyState, found: RefinementResult, limits: AcceptanceConfig
 ) -> tuple[Minimum[AnyState], RefinementResult]:
-    """Both with the statuses that the figures give, the minimum with the input of cars that they speak against.
+    """Set the statuses by the figures, and give refused cars their input state back.
 
-    A probability that is not known is no reason to return the input, evidence that is missing is one.
+    An unknown probability does not refuse a car, but missing evidence does.
     """
     status = minimum.status
-    # The iterations may run out where there is nothing left to gain.
+    # If the iterations ran out where nothing is left to gain, the car has converged.
     settled = (status == Status.max_iterations.code) & (promised_decrease(minimum) < _SETTLED_SHARE)
     status = torch.where(settled, Status.converged.code, status)
     refusal = refusal_of(found)
     unseen = is_refined(status) & (refusal >= 0)
     status = torch.where(unseen, refusal, status)
-    # What the model of trust has learnt does not hold where there is nothing to see.
+    # The model of trust does not hold where the images do not confirm a car.
     better, not_worse = (
         probability.masked_fill(unseen, torch.nan)
         for probability in (found.quality.probability_better, found.quality.probability_not_worse)
@@ -247,7 +248,7 @@ def judged(
 
 
 def promised_decrease(minimum: Minimum[AnyState]) -> Tensor:
-    """What a Gauss-Newton step from where the iterations ended promises (B,), as a share of the cost there."""
+    """The decrease (B,) that a Gauss-Newton step at the end promises, as a share of the cost at the end."""
     after = minimum.after
     gradient, hessian = after.gradient.sum(dim=1), after.hessian.sum(dim=1)
     at = minimum.stage.without_held(Evaluation(after.cost, gradient, hessian, ()))
@@ -258,16 +259,16 @@ def promised_decrease(minimum: Minimum[AnyState]) -> Tensor:
 
 
 def refusal_of(found: RefinementResult) -> Tensor:
-    """The status (B,) of states that the images do not confirm, else -1: masks, pixels that match, a known depth."""
+    """Status (B,) of states that mask, matching pixels or sigma of the depth refute; -1 for all other states."""
     quality, status = found.quality, torch.full_like(found.status_code, -1)
     depth_share = found.comparison.sigma_images[:, 0] / found.comparison.distance
-    # Comparisons with NaN are false.
+    # Comparisons with NaN are false, so NaN refuses a car.
     status = status.masked_fill(~(depth_share < _LARGEST_DEPTH_SHARE), Status.depth_unknown.code)
     left = quality.mask_iou_left
     if "photometric" in found.term_names:
         at_end = found.profile.after
         is_there = (at_end.offset_px.abs() < APART_PX) & (at_end.sigma_px < _LARGEST_OFFSET_SIGMA_PX)
-        # Its pixels are those of the left mask.
+        # The photometric term has the pixels of the left mask, so it has none where there is no left mask.
         seen = ((quality.matched_share >= _LEAST_MATCHED_SHARE) & is_there) | left.isnan()
         status = status.masked_fill(~seen, Status.no_match.code)
     if "silhouette_left" in found.term_names:

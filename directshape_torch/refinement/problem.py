@@ -1,7 +1,7 @@
-"""The energy of B cars (paper, E) as the solver sees it: what rays see of a state, stages, and their iterations.
+"""This module presents the energy of B cars (E in the paper) to the solver, with its stages and iterations.
 
-Nothing here remembers anything: a look at a state, the stage that begins there and every evaluation are values that
-are handed on to whoever needs them next.
+No object here keeps changing state: a look at a state, the stage that begins there and every evaluation are values that
+are passed on.
 """
 
 from __future__ import annotations
@@ -45,21 +45,22 @@ from directshape_torch.terms.term import (
 
 @dataclass(frozen=True)
 class CarProblem:
-    """Minimise the sum of terms over pose and shape of B cars: a `solver.Problem`."""
+    """This `solver.Problem` minimises the sum of terms over pose and shape of B cars."""
 
     prior: ShapePrior  # the family of shapes
     evidence: tuple[Evidence, ...]  # what the summands of the energy are made of
     extra_terms: tuple[Term, ...]  # a user's own summands, whose columns come last
-    masks: MaskRows  # the rays of both images, left ones first, which everything that looks at a state shares
-    rays: tuple[Rays, Rays]  # of the blocks of the left and of the right image by themselves
+    masks: MaskRows  # the rays of both images, left ones first, used by everything that looks at a state
+    rays: tuple[Rays, Rays]  # the rays of the left image and those of the right image
     config: RefinerConfig  # stages, trust region, samples per ray
-    # (B, T) of the columns of the terms of each car, beside their own weights; None for 1
+    # These factors (B, T) multiply the columns of costs of each car in addition to the weights of the terms. None
+    # stands for 1.
     factors: Tensor | None = None
-    sharing: Sharing = INDEPENDENT  # whose shapes are one
+    sharing: Sharing = INDEPENDENT  # which cars share one shape
 
     @property
     def term_names(self) -> tuple[str, ...]:
-        """Of the T columns of costs."""
+        """Names of the T columns of costs."""
         return tuple(name for each in (*self.evidence, *self.extra_terms) for name in each.names)
 
     def stages(self) -> list[StageConfig]:
@@ -68,19 +69,20 @@ class CarProblem:
     def parts(
         self, terms: tuple[Term, ...], field: Field, state: State, wheres: tuple[Where, ...], fisher: bool = True
     ) -> tuple[Part, ...]:
-        """What the terms, or the same ones of fewer cars, say of a state; with the Fisher information if that is asked.
+        """What terms of the problem, for all or fewer cars, say of a state; `fisher` asks for the Fisher information.
 
-        Ours in one function, which is compiled as a whole; terms of one's own by themselves, for what the compiler
-        makes of them must not concern ours: they may mark their functions `compile.compilable`.
+        The library's terms are evaluated in one function, which is compiled as a whole. A user's terms are evaluated
+        separately, so that they cannot disturb the compiled function. They may mark their own functions
+        `compile.compilable`.
         """
         own = len(terms) - len(self.extra_terms)
         extra = zip(terms[own:], wheres[own:], strict=True)
         of_extra = tuple(part_of(term, linear_of(term, field, state, where)) for term, where in extra)
-        # Compiled code has one form for both.
+        # Compiled code always computes the Fisher information, so that it has one form.
         return parts_of(terms[:own], field, state, wheres[:own], fisher or will_compile()) + of_extra
 
     def look(self, state: State) -> Sight:
-        """What every ray sees at a state, marched: constants; state and field keep their graphs."""
+        """March every ray at a state: what rays see are constants, but state and field keep their graphs."""
         with torch.no_grad():
             field = field_of(self.prior.bind(state.code))
             bounds, num_samples = self.prior.bounds_obj, self.config.silhouette.samples_per_ray
@@ -88,7 +90,7 @@ class CarProblem:
         return Sight(state, field_of(self.prior.bind(state.code)) if torch.is_grad_enabled() else field, *views)
 
     def begin(self, stage: int, sight: Sight) -> CarStage:
-        """The stage of that number, with everything fixed at a state that must not change while costs are compared."""
+        """The stage with number `stage`; it fixes at a state all that must stay constant while costs are compared."""
         stages = self.stages()
         config, earlier = stages[stage], stages[: range(len(stages))[stage]]
         after_wider = any(other.contour_width_px > config.contour_width_px for other in earlier)
@@ -116,7 +118,7 @@ class CarProblem:
 
 @dataclass(frozen=True)
 class CarStage:
-    """A stage that has begun."""
+    """This is a stage that has begun."""
 
     problem: CarProblem  # of B cars
     config: StageConfig  # of the stage
@@ -139,7 +141,7 @@ class CarStage:
         return [term.is_prior for term in self.terms for _ in term.names]
 
     def information_of_measurements(self, figures: Figures) -> Tensor | None:
-        """The Fisher matrix (B, D, D) of the terms that are no priors; None without any."""
+        """The Fisher matrix (B, D, D) of all terms except the priors; None if all terms are priors."""
         seen = [
             part for part, prior in zip(figures.information.unbind(1), self.is_prior_column, strict=True) if not prior
         ]
@@ -147,11 +149,11 @@ class CarStage:
 
     @cached_property
     def _constant_terms(self) -> tuple[Term, ...]:
-        """The terms as compiled code takes them; those of the stage may be differentiated."""
+        """The terms in the form of compiled code, in which they are constants; `terms` may be differentiated."""
         return tuple(with_varying_blocks(term) for term in self.terms)
 
     def figures(self, sight: Sight) -> Figures:
-        """The energy at a state, column by column, with every ray marched; differentiable where gradients are on."""
+        """The energy of each column at a state, with every ray marched; differentiable if gradients are enabled."""
         terms = self.terms if torch.is_grad_enabled() else self._constant_terms
         wheres = tuple(term.where(sight) for term in terms)
         parts = self.problem.parts(terms, sight.field, sight.state, wheres)
@@ -174,10 +176,10 @@ class CarStage:
         )
 
     def start(self, sight: Sight) -> tuple[CarIterations, Evaluation]:
-        """What the iterations work on, and the energy where they begin."""
+        """The problem of the iterations, and the energy where they begin."""
         problem = self.problem
-        # What is differentiated afterwards is the marched energy, so its minimum must be found: under `no_grad`
-        # too, for evaluation gives the results of training.
+        # The marched energy is differentiated afterwards, so its minimum must be found. This holds under `no_grad` too,
+        # so that evaluation and training give equal results.
         if problem.config.solver.rays == "marched" or problem.config.backward.mode != "none":
             terms, rest = self._with_joined_priors(), None
             wheres = tuple(term.where(sight) for term in terms)
@@ -190,9 +192,10 @@ class CarStage:
         return iterations, iterations.evaluated(sight.field, sight.state, wheres)
 
     def _with_joined_priors(self) -> tuple[Term, ...]:
-        """The terms with our priors as one, where cars have no factors of their own; a user's stay by themselves.
+        """The terms with the library's priors joined into one, if cars have no factors; a user's terms stay separate.
 
-        Fewer operations; in compiled code, which has one form for this and for `figures`, they cost nothing.
+        A joined prior needs fewer operations. Compiled code does not join priors: it has one form for this and for
+        `figures`, and separate priors cost nothing there.
         """
         own = self.terms[: len(self.terms) - len(self.problem.extra_terms)]
         priors = [term for term in own if isinstance(term, PriorTerm) and term.is_prior]
@@ -211,7 +214,7 @@ class CarStage:
         return self.without_held(summed(layout.sums(), layout.weight, parts))
 
     def without_held(self, at: Evaluation) -> Evaluation:
-        """What the solver sees of it: an unknown that the stage holds has no slope and a curvature of its own."""
+        """The evaluation for the solver, in which a fixed unknown has gradient 0 and an uncoupled curvature of 1."""
         if self.config.unknowns == "both":
             return at
         moving = self.unknowns.moving(self.config.unknowns, at.gradient.device)
@@ -220,7 +223,7 @@ class CarStage:
         return at._replace(gradient=torch.where(moving, at.gradient, torch.zeros_like(at.gradient)), hessian=hessian)
 
     def free_unknowns(self, state: State) -> Tensor:
-        """Unknowns (B, D) that neither a bound nor the stage holds."""
+        """Unknowns (B, D) that are free: a bound or the stage may fix others."""
         free = self.unknowns.free(state, self.problem.config.solver.max_code)
         return free & self.unknowns.moving(self.config.unknowns, free.device)
 
@@ -235,7 +238,7 @@ class CarStage:
 
 @dataclass(frozen=True)
 class _Layout:
-    """The blocks of all terms, one after the other."""
+    """This lists the blocks of all terms, one term after the other."""
 
     owner: Tensor  # (M,) car
     column: Tensor  # (M,) of the costs
@@ -259,20 +262,20 @@ class _Layout:
         return cls(owner, column, weight, information, len(terms[0].blocks.counts), num_columns)
 
     def sums(self) -> CarSums:
-        """Over the blocks of each car."""
+        """Sums over the blocks of each car."""
         return CarSums.of(self.owner, self.num_cars)
 
 
 @dataclass(frozen=True)
 class CarIterations:
-    """The cars of a stage that still move: a `solver.StageProblem`."""
+    """This `solver.StageProblem` holds the cars of a stage that still move."""
 
     stage: CarStage  # of all cars of the problem
     terms: tuple[Term, ...]  # of the B cars that still move, with the rows that can still change
     layout: _Layout  # of the blocks of these terms
     sums: CarSums  # over these blocks
-    rest: Tensor | None  # (B,) cost of the other rows; None where every row is marched at every state
-    factors: Tensor | None  # as in `CarProblem`, like the next two
+    rest: Tensor | None  # (B,) cost of rows that cannot change; None if every row is marched at every state
+    factors: Tensor | None  # see `CarProblem`; this also holds for `masks` and `sharing`
     masks: MaskRows
     sharing: Sharing
 
@@ -290,7 +293,7 @@ class CarIterations:
         return cls(stage, terms, layout, layout.sums(), rest, factors, masks, sharing)
 
     def evaluate(self, state: State, near: Evaluation) -> Evaluation:
-        """The energy at a state, looking near where it was evaluated last."""
+        """The energy at a state; the terms look near the points of the evaluation `near`."""
         problem = self.stage.problem
         if self.rest is None:
             sight = replace(problem, masks=self.masks, rays=self.masks.of_sides()).look(state)
@@ -298,7 +301,7 @@ class CarIterations:
         return self.evaluated(field_of(problem.prior.bind(state.code)), state, near.wheres)
 
     def evaluated(self, field: Field, state: State, wheres: tuple[Where, ...]) -> Evaluation:
-        """The energy at a state, looking near the points given."""
+        """The energy at a state; the terms look near the points `wheres`."""
         problem, terms = self.stage.problem, self.terms
         parts = problem.parts(terms, field, state, wheres, fisher=False)
         if problem.config.solver.jacobian == "autograd":
@@ -310,7 +313,7 @@ class CarIterations:
         return self.stage.without_held(at._replace(cost=cost))
 
     def choose(self, accepted: Tensor, new: Evaluation, old: Evaluation) -> Evaluation:
-        """The new evaluation of cars whose step was accepted (B,), the old one of the others."""
+        """Take the new evaluation of cars whose step was accepted (B,), and the old one of all others."""
         conditions = accepted, accepted[:, None], accepted[:, None, None]
         cost, gradient, hessian = (torch.where(*x) for x in zip(conditions, new[:3], old[:3], strict=True))
 
@@ -328,7 +331,7 @@ class CarIterations:
         return self.stage.unknowns.retract(state, step, max_code, LARGEST_ROTATION_RAD)
 
     def of_problems(self, keep: Tensor, numbers: Sequence[int], at: Evaluation) -> tuple[CarIterations, Evaluation]:
-        """Those of the cars where `keep` (B,) holds, `numbers` of them, with their evaluation."""
+        """The iterations and the evaluation of the cars where `keep` (B,) holds; these cars have the `numbers`."""
         index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
 
         def kept(term: Term, where: Where) -> Where:
@@ -346,10 +349,11 @@ class CarIterations:
 
 
 def method_stages(config: RefinerConfig) -> list[StageConfig]:
-    """The stages of `config.method`: rounds of its own for "geometric", else those of the configuration."""
+    """Stages of `config.method`: "geometric" has its own rounds, other methods have the configured stages."""
     if config.method != "geometric":
         return list(config.stages)
-    # Contour and pyramid level mean nothing to a point cloud: the last stage's, for whoever draws or measures.
+    # Contour and pyramid level do not affect a point cloud. They are those of the last stage, for pictures and
+    # measurements.
     last, cloud = config.stages[-1], config.point_cloud
     pose_stage, shape_stage, joint_stage = (
         StageConfig(last.contour_width_px, last.image_level, cloud.max_iterations, unknowns=unknowns)

@@ -1,4 +1,4 @@
-"""How well a car fits what the images show, and the figures that say whether to trust it (`refinement.trust`)."""
+"""This module measures how well a car fits the images, and computes the evidence for `refinement.trust`."""
 
 from __future__ import annotations
 
@@ -17,25 +17,26 @@ from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.silhouette import MaskRows
 from directshape_torch.terms.term import Figures, Part, Sight
 
-# The contrast of images that show nothing but noise, grey levels.
+# Images that show only noise have this contrast, in grey levels.
 _LEAST_CONTRAST = 0.3
 
 
 @dataclass(frozen=True)
 class FitQuality(CarRecord):
-    """Agreement of B refined cars with the images; NaN where there is nothing to compare.
+    """This is the agreement of B refined cars with the images. It is NaN where there is nothing to compare.
 
     Attributes:
-        mask_iou_left, mask_iou_right: (B,) overlap of the projected shape with the instance mask over the sampled,
-            unoccluded pixels. Good fits stand above 0.9; below 0.8 mask or fit is wrong.
+        mask_iou_left, mask_iou_right: (B,) IoU of the projected shape with the instance mask over the sampled,
+            unoccluded pixels. Good fits have more than 0.9. Below 0.8 the mask or the fit is wrong.
         photometric_error_grey: (B,) mean absolute difference between the images over the pixels that count, in grey
             levels of 0..255, after matching the brightness.
         matched_share: (B,) share of the photometric pixel set that could be compared at the end.
-        evidence: (B, E) whether the car is there at all, columns `trust.EVIDENCE_NAMES`.
+        evidence: (B, E) evidence that the car is there at all, columns `trust.EVIDENCE_NAMES`.
         probability_better: (B,) calibrated probability that the returned box overlaps the true one more than the
             input does, seen from above; NaN for all methods but "direct".
-        probability_not_worse: (B,) that its overlap is at least the input's less 0.05. Figures of cars whose status is
-            `not_trusted` or `no_car` are of the refinement that was not returned.
+        probability_not_worse: (B,) calibrated probability that the overlap of the returned box is at least the input's
+            overlap minus 0.05. For cars with status `not_trusted` or `no_car` all figures belong to the refinement that
+            was not returned.
     """
 
     mask_iou_left: Annotated[Tensor, Dense("B")]
@@ -59,12 +60,12 @@ def fit_quality(
     """Figures of B cars at the end of a refinement.
 
     Args:
-        stage: the last one.
-        figures: of the energy at the final states.
-        seen: what the rays see there.
-        halves_apart: (B,) of the disparity profile.
-        distance_in_sigmas: (B,) from the detector's box.
-        chances: (B,) twice, of a better and of a not worse box where the car is there.
+        stage: the last stage of the refinement.
+        figures: the energy at the final states.
+        seen: what the rays see at the final states.
+        halves_apart: (B,) see `DisparityProfile.halves_apart`.
+        distance_in_sigmas: (B,) distance from the detector's box, see `DetectorComparison`.
+        chances: two probabilities (B,) of a better box and of a box that is not worse, if the car is there.
     """
     left, right = mask_ious(stage.problem.masks, seen)
     error, share, contrast = [torch.full_like(left, torch.nan)] * 3
@@ -84,7 +85,7 @@ def fit_quality(
 
 
 def mask_ious(masks: MaskRows, seen: Sight) -> Tensor:
-    """Overlap (2, B) of shape and mask over the pixels of the left and the right image."""
+    """IoU (2, B) of shape and mask over the pixels of the left and the right image."""
     distance = seen.field.value(seen.closest.points_obj, masks.rays.owner)
     counts = masks.filled.to(torch.float64)
     covered, masked = seen.closest.crosses & (distance < 0), masks.foreground > MASK_THRESHOLD
@@ -96,9 +97,10 @@ def mask_ious(masks: MaskRows, seen: Sight) -> Tensor:
 
 
 def photometric_agreement(term: Photometric, at: Part) -> tuple[Tensor, Tensor, Tensor]:
-    """The mean absolute residual (B,) in grey levels of the usable pixels, their share (B,) of the set, their contrast.
+    """Measure the mean absolute residual (B,) of the usable pixels, their share (B,) of the set, and their contrast.
 
-    The contrast (B,) is the mean absolute deviation of grey levels from the mean of their neighbourhood.
+    Residual and contrast are in grey levels. The contrast (B,) is the mean absolute deviation of grey levels from the
+    mean of their neighbourhood.
     """
     fixed, usable = term.pixel_set, at.where.usable
     in_set = usable & (fixed.rows.pixel_weight > 0)

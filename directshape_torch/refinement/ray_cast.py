@@ -1,4 +1,4 @@
-"""What any rays see of one car: for pictures, reports and measurements, which look elsewhere than a refinement does."""
+"""This module casts any rays at one car, for pictures, reports and measurements."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from directshape_torch.terms.depth import closest_of_march, first_hits, march
 
 
 class RayCast(NamedTuple):
-    """What P rays meet."""
+    """This says what P rays meet."""
 
     closest_sdf: Tensor  # (P,) least signed distance along the ray, metres; infinite where it misses the prior's bounds
     depth: Tensor  # (P,) where it enters the car, metres of depth in its own camera; NaN where it passes by
@@ -31,7 +31,7 @@ def cast(
     ray_cam: Tensor,  # (P, 3) of unit depth, in the left camera's frame
     num_samples: int = 32,
 ) -> RayCast:
-    """Cast rays at one car, each a block of its own."""
+    """Cast rays at one car; each ray is a separate block."""
     owner = torch.zeros(len(ray_cam), dtype=torch.long, device=ray_cam.device)
     field = field_of(prior.bind(state.code))
     rays = Rays(owner, centre_cam.expand_as(ray_cam), ray_cam.mT[..., None]).in_objects(state.T_obj_cam)

@@ -1,4 +1,4 @@
-"""Cars where a minimisation has left them, what is said of that, and the graph of the backward mode."""
+"""This module holds cars after a minimisation, judges them and builds the graph of the backward mode."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from directshape_torch.status import Status, is_refined
 
 @dataclass(frozen=True)
 class Refined(Generic[AnyState]):
-    """B cars after a minimisation, with the statuses that evidence and trust give them."""
+    """These are B cars after a minimisation, with the statuses that evidence and trust give them."""
 
     problem: CarProblem
     cars: CarBatch
@@ -32,14 +32,14 @@ class Refined(Generic[AnyState]):
     def of(
         cls, problem: CarProblem, cars: CarBatch, initial: AnyState, start: AnyState, came: RefinementResult
     ) -> Refined[AnyState]:
-        """Minimise and judge.
+        """Minimise the problem and judge the cars.
 
         Args:
-            problem: of B cars.
-            cars: these.
+            problem: the problem of B cars.
+            cars: the B cars.
             initial: input states.
             start: where the iterations begin.
-            came: what is known of the cars beforehand.
+            came: what is known of the cars before the minimisation.
         """
         repeats_steps = torch.is_grad_enabled() and problem.config.backward.mode == "unroll"
         with torch.no_grad():
@@ -56,8 +56,8 @@ class Refined(Generic[AnyState]):
 
         Args:
             start: where the iterations began, as a function of the input.
-            ends: (B,) bool, cars that are wanted where their iterations ended, trusted or not, and no others; default
-                those that were refined.
+            ends: (B,) bool, cars whose states are wanted where their iterations ended, whether they are trusted or not.
+                Default: the cars that were refined.
         """
         minimum = self.minimum if ends is None else _at_ends(self.minimum, ends)
         wanted = is_refined(minimum.status)

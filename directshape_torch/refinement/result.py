@@ -1,4 +1,4 @@
-"""What a refinement gives back for every car."""
+"""This module defines the result of a refinement."""
 
 from __future__ import annotations
 
@@ -36,13 +36,14 @@ if TYPE_CHECKING:
 
 
 Frame = Literal["ref", "cam"]
-# Cars that a result shows when it is printed, and the probability to have got better below which one is doubtful.
+# A printed result shows this many cars. A car is doubtful if its probability to have got better is below the second
+# number.
 _PRINTED_CARS, _DOUBTFUL_BELOW = 40, 0.5
 
 
 @dataclass(frozen=True)
 class KittiBoxes:
-    """Boxes in KITTI's convention, measured on the refined zero level.
+    """These boxes in KITTI's convention are measured on the refined zero level.
 
     Attributes:
         dimensions_hwl: (B, 3) height, width, length, metres.
@@ -59,40 +60,42 @@ class KittiBoxes:
 
 @dataclass(frozen=True, repr=False)
 class RefinementResult(CarRecord):
-    """Outcome of a refinement of B cars, in the order of the detections.
+    """This is the outcome of a refinement of B cars, in the order of the detections.
 
-    A result is indexed by a number, a slice, numbers or booleans, one a car, and is a result again; `for car in result`
-    gives results of one car. `.to(...)`, `.cpu()` and `.detach()` are those of tensors. Poses, codes and boxes have the
-    dtype of the inputs (float32, float64); costs, covariances and all figures of quality are float64; statuses and
-    iterations are int64.
+    A result can be indexed by a number, a slice, a list of numbers or one boolean for each car, which gives another
+    result. `for car in result` gives results of one car. `.to(...)`, `.cpu()` and `.detach()` work as for tensors.
+    Poses, codes and boxes have the dtype of the inputs (float32, float64). Costs, covariances and all figures of
+    quality are float64. Statuses and iterations are int64.
 
     Attributes:
-        T_cam_obj: (B, 4, 4) refined poses; the input's where the status says so.
-        code: (B, K) shape codes, standard deviations.
+        T_cam_obj: (B, 4, 4) refined poses, or the input poses where the status says that the car was not refined.
+        code: (B, K) shape codes, in standard deviations.
         status_code: (B,) integer, see `status`.
         iterations: (B,) Gauss-Newton iterations.
         term_names: names of the T terms.
-        cost_before, cost_after: (B, T) cost of each term for input and output, both at the final stage; NaN for cars
-            that were not refined at all. Those of `not_trusted` cars are of the refinement that was not returned.
-        covariance: (B, 6 + K, 6 + K) in the tangent `(v, omega, dcode)` of the object frame; uncalibrated (relative).
-            NaN for cars that were not refined.
-        covariance_xyz_yaw: (B, 4, 4) of the returned box's place (x, y, z) in the reference frame and of its heading,
-            in true units: metres and radians; see `sigma_xyz_yaw`.
-        cost_history: (B, n) cost after each iteration, NaN where a car took no part; not comparable across
-            stages, each of which begins when the slowest car of the batch has ended the one before.
+        cost_before, cost_after: (B, T) cost of each term for input and output, both at the final stage. They are NaN
+            for cars that took no part in the refinement. For `not_trusted` cars they belong to the refinement that was
+            not returned.
+        covariance: (B, 6 + K, 6 + K) covariance in the tangent `(v, omega, dcode)` of the object frame, uncalibrated
+            (relative). It is NaN for cars that were not refined.
+        covariance_xyz_yaw: (B, 4, 4) covariance of the returned box's place (x, y, z) in the reference frame and of its
+            heading, calibrated, in metres and radians; see `sigma_xyz_yaw`.
+        cost_history: (B, n) cost after each iteration, NaN where a car took no part. Costs of different stages cannot
+            be compared. A stage begins when the slowest car of the batch has ended the previous stage.
         quality: agreement of each refined car with masks and images.
-        observability: what its view does not show; `observability.words()` says it in words.
-        profile: photometric cost over the disparity at input and end; of `not_trusted` cars at the end that was not
-            returned.
-        comparison: how far the images' box of each refined car and the detector's lie apart, and what is known of the
-            box that both give together.
-        input_dimensions_hwl: (B, 3) of the detections, metres.
+        observability: which directions the view of a car does not show; `observability.words()` describes them.
+        profile: photometric cost over the disparity at input and end. For `not_trusted` cars the end is the state that
+            was not returned.
+        comparison: how far the images' box and the detector's box of each refined car are apart, and what is known of
+            the box that combines both.
+        input_dimensions_hwl: (B, 3) dimensions of the detections, metres.
         ground_source: where the ground plane of each car's frame came from, B entries.
-        t_cam_ref: (B, 3) `x_cam = x_ref + t_cam_ref`.
-        track_part: (B,) int64, 0 for cars that share their shape with other views of their track, or the number of the
-            part, where a track's views cannot be of one car and it was split; -1 for shapes of one view.
-        prior: the shapes.
-        has_shape: the shape was refined, so that boxes are measured on it; False for the method "box_alignment".
+        t_cam_ref: (B, 3) shift between the frames: `x_cam = x_ref + t_cam_ref`.
+        track_part: (B,) int64, 0 for cars that share their shape with other views of their track. If a track was split,
+            because its views cannot show one car, this is the number of the part. It is -1 for shapes of one view.
+        prior: the family of shapes.
+        has_shape: whether the shape was refined, so that boxes are measured on it; False for the method
+            "box_alignment".
 
     Examples:
         >>> import pathlib
@@ -141,16 +144,16 @@ class RefinementResult(CarRecord):
         return self.rows(_chosen_rows(index, len(self)))
 
     def __iter__(self) -> Iterator[Self]:
-        """Results of one car each."""
+        """Iterate over results of one car each."""
         return (self[row] for row in range(len(self)))
 
     def rows(self, index: Tensor) -> Self:
-        """The cars `index` (M,), in that order."""
+        """The result of the cars `index` (M,), in the order of `index`."""
         sources = tuple(self.ground_source[row] for row in index.tolist())
         return replace(super().rows(index), ground_source=sources)
 
     def to(self, device: torch.device | torch.dtype | str | None = None, dtype: torch.dtype | None = None) -> Self:
-        """On another device, poses, codes and shapes of another dtype; a prior that moves is a copy.
+        """The result on another device, or with poses, codes and shapes of another dtype; a changed prior is a copy.
 
         Raises:
             InputError: half precision, which cannot hold a pose.
@@ -166,7 +169,7 @@ class RefinementResult(CarRecord):
         return replace(moved, prior=_moved_prior(self.prior, moved.T_cam_obj))
 
     def numpy(self) -> dict[str, NDArray[Any]]:
-        """All tensors as arrays by the names of `state_dict`, the boxes in the frame of labels, and words."""
+        """All tensors as arrays by the names of `state_dict`, boxes in the reference frame, and arrays of words."""
         boxes = self.boxes()
         tensors = {**self.detach().cpu().state_dict(), **{f"boxes.{name}": x for name, x in vars(boxes).items()}}
         words = {
@@ -182,8 +185,8 @@ class RefinementResult(CarRecord):
         """The result whose `state_dict()` this is, read back by `torch.load(weights_only=True)` or safetensors.
 
         Args:
-            state: tensors by name.
-            prior: the shapes of the result, which its state does not hold; default the bundled ones.
+            state: the tensors by their names.
+            prior: the shapes of the result, which its state does not hold. Default: the bundled shapes.
 
         Raises:
             InputError: a tensor is missing or none of its kind, the prior has another number of codes, or a refined car
@@ -200,9 +203,10 @@ class RefinementResult(CarRecord):
         return result
 
     def __repr__(self) -> str:
-        """Counts of the statuses, what those of cars that were not refined mean, and a table of up to 40 cars.
+        """Print counts of the statuses, the meaning of each refusing status, and a table of up to 40 cars.
 
-        Of more cars those that were not refined, or got better with a probability below 0.5, come before all others.
+        If there are more cars, those that were not refined or that got better with a probability below 0.5 are chosen
+        first.
         """
         lines = [f"RefinementResult of {len(self)} cars ({self.T_cam_obj.dtype}, {self.T_cam_obj.device})"]
         counts = Counter(self.status).most_common()
@@ -224,9 +228,9 @@ class RefinementResult(CarRecord):
         return "\n".join(lines + left_out)
 
     def _printed_rows(self) -> tuple[Tensor, list[str]]:
-        """The cars (N,) that a print shows, and a sentence on those that it leaves out, where it leaves out any."""
+        """Rows (N,) of the cars that a print shows, and a sentence on the cars that it leaves out, if there are any."""
         doubtful = (~self.refined | (self.quality.probability_better.detach() < _DOUBTFUL_BELOW)).cpu()
-        # A stable order: the doubtful ones first, each in the order of the detections.
+        # The sort is stable: doubtful cars come first, and both groups keep the order of the detections.
         order = torch.argsort(~doubtful, stable=True)
         shown = order[:_PRINTED_CARS].sort().values
         left_out, num_doubtful = len(self) - len(shown), int(doubtful.sum()) - int(doubtful[shown].sum())
@@ -238,12 +242,12 @@ class RefinementResult(CarRecord):
 
     @property
     def status(self) -> list[Status]:
-        """How each car ended; `status.value` is the message."""
+        """Status of each car; `status.value` is its message."""
         return [Status.from_code(code) for code in self.status_code.tolist()]
 
     @property
     def refined(self) -> Tensor:
-        """(B,) bool: cars whose state is a refined one."""
+        """Whether (B,) the state of each car is a refined one."""
         return is_refined(self.status_code)
 
     @property
@@ -254,11 +258,12 @@ class RefinementResult(CarRecord):
         return self.T_cam_obj - shift
 
     def boxes(self) -> KittiBoxes:
-        """KITTI boxes of the refined zero level, sub-voxel; the location is the level's own bottom centre.
+        """KITTI boxes of the refined zero level, with sub-voxel precision.
 
-        Cars that were not refined have the detector's box, boxes that were moved alone its dimensions.
+        Cars that were not refined have the detector's box. Boxes from the method "box_alignment" have the detector's
+        dimensions.
 
-        Location is `T_ref_obj` of (mid x, max y, mid z) of the level, not the object origin.
+        The location is `T_ref_obj` of the level's bottom centre (mid x, max y, mid z), not the object origin.
         """
         T_ref_box, dimensions = self._boxes("ref")
         location, rotation_y = T_ref_box[:, :3, 3], rotation_y_from_pose(T_ref_box)
@@ -267,13 +272,13 @@ class RefinementResult(CarRecord):
     def to_boxes(
         self, convention: BoxFormat = "kitti", frame: Frame = "cam", T_cam_boxes: Tensor | None = None
     ) -> Tensor:
-        """The boxes of `boxes()` as (B, 7) numbers in the convention of a detector, what `Detections.from_boxes` takes.
+        """Boxes (B, 7) as numbers in the convention of a detector, which `Detections.from_boxes` takes.
 
         Args:
             convention: order and meaning of the numbers, see `directshape_torch.geometry.box_formats`.
-            frame: "cam", the left camera's, or "ref", that of labels, for camera conventions.
-            T_cam_boxes: rigid motion to the left camera, (4, 4) or (B, 4, 4), from the frame in which the boxes shall
-                be; needed for LiDAR conventions, and in place of `frame`.
+            frame: "cam" (left camera) or "ref" (reference frame of labels), for camera conventions.
+            T_cam_boxes: rigid motion (4, 4) or (B, 4, 4) to the left camera from the frame that the boxes shall have.
+                It is needed for LiDAR conventions and replaces `frame`.
 
         Raises:
             InputError: an unknown convention or frame, or a LiDAR convention without `T_cam_boxes`.
@@ -282,9 +287,10 @@ class RefinementResult(CarRecord):
         return poses_to_boxes(T_frame_box, dimensions, convention, T_cam_boxes)
 
     def corners(self, frame: Frame = "cam") -> Tensor:
-        """Corners (B, 8, 3) of the same boxes in the order of KITTI's devkit, which `Detections.from_boxes` reads.
+        """Corners (B, 8, 3) of the boxes in the order of KITTI's devkit, which `Detections.from_boxes` reads.
 
-        The four on the ground, from the front left one on to the front right one and round, then those above.
+        The four corners on the ground come first, from front left to front right and round the box, then the four
+        corners above them.
 
         Raises:
             InputError: a frame that is neither "cam" nor "ref".
@@ -293,11 +299,11 @@ class RefinementResult(CarRecord):
 
     @full_precision()
     def _boxes(self, frame: str) -> tuple[Tensor, Tensor]:
-        """Poses (B, 4, 4) of the boxes, their origins in the middle of the bottom faces, and dimensions (B, 3)."""
+        """Poses (B, 4, 4) of the boxes with origins in the middle of the bottom faces, and dimensions (B, 3)."""
         if frame not in ("ref", "cam"):
             raise InputError("frame", "'cam' or 'ref'", repr(frame))
         T = self.T_ref_obj if frame == "ref" else self.T_cam_obj
-        # A car whose shape was not refined keeps the detector's box, not one of the mean shape.
+        # A car whose shape was not refined keeps the detector's dimensions and does not get those of the mean shape.
         rows = (self.refined & self.has_shape).nonzero()[:, 0]
         bottom, hwl = level_boxes(self.prior, T[rows], self.code[rows])
         dimensions = self.input_dimensions_hwl.index_copy(0, rows, hwl)
@@ -308,16 +314,16 @@ class RefinementResult(CarRecord):
     def sigma_xyz_yaw(self) -> Tensor:
         """Standard deviations (B, 4) of the box's place in `ref` and of its heading, metres and radians.
 
-        They are NaN for cars that were not refined, and for boxes that were moved alone. They are scales of Student's t
-        of 4 degrees of freedom, fitted to cars with labels (docs/results.md), within which 63 % of the errors lie. A
-        rig's own disparity error is in them as far as the covariance of its field, `rig.disparity_sigma_px` or
-        `Detections.offset_sigma_px` says.
+        They are NaN for cars that were not refined, and for boxes of the method "box_alignment". They are scales of
+        Student's t of 4 degrees of freedom, fitted to cars with labels (docs/results.md), within which 63 % of the
+        errors lie. They include a rig's own disparity error as far as the covariance of its field,
+        `rig.disparity_sigma_px` or `Detections.offset_sigma_px` describes it.
         """
         return self.covariance_xyz_yaw.diagonal(dim1=1, dim2=2).sqrt()
 
     @full_precision()
     def mesh(self, index: int) -> trimesh.Trimesh:
-        """Surface of one car in the left camera frame, metres, outward normals.
+        """Surface of one car in the left camera frame, in metres, with outward normals.
 
         Raises:
             InputError: no such car.
@@ -354,7 +360,7 @@ class RefinementResult(CarRecord):
 
 
 def _check_state(result: RefinementResult) -> None:
-    """Raise `InputError` for words, dtypes or statuses that do not fit: what shapes of tensors do not say."""
+    """Raise `InputError` for words, dtypes or statuses that do not fit; shapes of tensors are checked elsewhere."""
     for name in ("code", "input_dimensions_hwl", "t_cam_ref"):
         check_alike(f"state['{name}']", getattr(result, name), "state['T_cam_obj']", result.T_cam_obj)
     words = {"term_names": result.cost_after.shape[1], "ground_source": len(result)}
@@ -366,7 +372,7 @@ def _check_state(result: RefinementResult) -> None:
 
 
 def _check_refined(result: RefinementResult) -> None:
-    """Refined cars have finite figures, as the refiner gives them."""
+    """Raise `InputError` unless refined cars have finite figures, as results of the refiner do."""
     boxes = result.boxes()
     figures = (result.code, result.cost_after, *vars(boxes).values())
     if result.has_shape:
@@ -379,7 +385,7 @@ def _check_refined(result: RefinementResult) -> None:
 
 
 def _chosen_rows(index: object, count: int) -> Tensor:
-    """Numbers of the cars that an index names, as NumPy understands it."""
+    """Numbers of the cars that an index selects by the rules of NumPy."""
     try:
         given = index.detach().cpu().numpy() if isinstance(index, Tensor) else index
         rows = np.atleast_1d(np.arange(count)[given])  # type: ignore[call-overload]
@@ -387,7 +393,7 @@ def _chosen_rows(index: object, count: int) -> Tensor:
         raise InputError("index", _cars_in_words(count), shown(index)) from error
     if rows.ndim > 1:
         raise InputError("index", _cars_in_words(count), shown(index))
-    # PyTorch knows no strides below 0.
+    # PyTorch does not support negative strides.
     return torch.from_numpy(rows.copy())
 
 
@@ -396,7 +402,7 @@ def _cars_in_words(count: int) -> str:
 
 
 def _moved_prior(prior: ShapePrior, like: Tensor) -> ShapePrior:
-    """The shapes with dtype and device of `like`: themselves where they have them, else a copy."""
+    """The prior with dtype and device of `like`; it is copied only if dtype or device differ."""
     origin = prior.origin
     if not isinstance(prior, nn.Module) or (origin.dtype, origin.device) == (like.dtype, like.device):
         return prior

@@ -1,4 +1,4 @@
-"""The problem of a call: the terms of its method, made of what its images show, and a user's own."""
+"""This module makes the problem of a call from the terms of its method, the images and a user's own terms."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from directshape_torch.terms.priors import prior_terms
 from directshape_torch.terms.silhouette import MaskRows, SilhouetteEvidence
 from directshape_torch.terms.term import Evidence, Term
 
-# That of "point_cloud" holds for the methods with points, the first two for the others.
+# The weight of "point_cloud" holds for the methods with points. The first two hold for the methods with images.
 _WEIGHTS = "silhouette.weight, photometric.weight, point_cloud.weight, priors.*_weight"
-# Part of the weight of points that is best beside images.
+# If images take part, the weight of points is divided by this number, which gave the best results.
 _BESIDE_IMAGES = 10
 
 TermFactory: TypeAlias = Callable[[FrameBatch, Detections, CarBatch, ShapePrior], Term]
-"""Makes a user's term for some cars of a call: of these frames, all detections, the cars to refine, the shapes."""
+"""It makes a user's term for some cars of a call from the frames, all detections, the cars to refine and the prior."""
 
 
 def problem_of_scene(
@@ -49,9 +49,10 @@ def problem_of_scene(
     extra_terms: Sequence[TermFactory] = (),
     term_weights: Mapping[str, Tensor] | None = None,
 ) -> CarProblem:
-    """The problem of `config.method`; terms of weight zero are left out, so ablations cost nothing.
+    """Make the problem of `config.method`; terms of weight zero are left out, so that ablations cost nothing.
 
-    The B cars are the rows `cars.detection_row` of the detections, as of `term_weights`; `observation` what they see.
+    The B cars are the rows `cars.detection_row` of the detections and of `term_weights`. `observation` is what the
+    images show of them.
 
     Raises:
         ConfigError: every term has weight zero, so there is nothing to minimise.
@@ -83,7 +84,7 @@ def problem_of_scene(
 
 
 def _made(make: TermFactory, frames: FrameBatch, detections: Detections, cars: CarBatch, prior: ShapePrior) -> Term:
-    """A user's term; an error of the factory is named, for tensors of all detections do not fit those of the cars."""
+    """Make a user's term; errors of the factory are named, because tensors of all detections do not fit the cars."""
     called = f"extra term of {getattr(make, '__qualname__', type(make).__name__)}"
     cure = "the cars are the rows cars.detection_row of the detections: take these rows of other tensors too"
     with named_errors(called, len(cars), cure):
@@ -93,7 +94,7 @@ def _made(make: TermFactory, frames: FrameBatch, detections: Detections, cars: C
 
 
 def _check_extra(problem: CarProblem, cars: CarBatch) -> None:
-    """Raise `InputError` unless a user's terms are what `Term` says, at the detector's poses."""
+    """Raise `InputError` unless a user's terms obey `Term` at the detector's poses."""
     if not problem.extra_terms:
         return
     code = problem.prior.initial_code(len(cars)).to(cars.detector_T_cam_obj)
@@ -112,7 +113,7 @@ def _pyramid(frames: FrameBatch, num_halvings: int) -> list[GreyPair]:
 
 
 def _factors(weights: Mapping[str, Tensor] | None, names: Sequence[str], code: Tensor) -> Tensor | None:
-    """Factors (detections, T) of the columns from those given by name, 1 for the others."""
+    """Factors (detections, T) of the columns from `weights` by name; columns without a weight have factor 1."""
     if weights is None:
         return None
     for name, weight in weights.items():

@@ -1,8 +1,9 @@
-"""How probable it is that a returned box is better than the detector's.
+"""This module computes how probable it is that a returned box is better than the detector's box.
 
-Where the car is there, its true box has the distribution that `fusion` gives from images and detector, and samples of
-it say how often the returned box overlaps it more than the detector's. Whether the car is there at all, and not another
-one or none, a logistic regression says from three columns of evidence. Derivation: docs/derivations/fusion.md.
+If the car is there, its true box has the distribution that `fusion` gives from images and detector. Samples of this
+distribution show how often the returned box overlaps the true box more than the detector's box does. A logistic
+regression on three columns of evidence gives the probability that the car is there, and not another car or none. The
+derivation is in docs/derivations/fusion.md.
 """
 
 from __future__ import annotations
@@ -25,42 +26,42 @@ from directshape_torch.refinement.observability import HEADING_LEVER_M
 SCHEMA = "directshape_torch.trust_model/2"
 BUNDLED = Path(__file__).parents[1] / "assets" / "trust_model.json"
 WORSE_BY = 0.05
-"""A box is worse whose bird's-eye IoU is less than the input's by more than this."""
+"""A box is worse if its bird's-eye IoU is below the input's by more than this."""
 
 EVIDENCE_NAMES = ("log_halves_apart", "log_error_over_contrast", "log_detector_distance")
-"""Columns of the evidence that a car is there.
+"""These are the columns of the evidence that a car is there.
 
-`log_halves_apart`: by how much the photometric cost of upper, lower, left and right half of a car's pixels falls where
-each takes its own best disparity, which pixels of one surface have in common; sum of the logarithms, plus 0.02.
-`log_error_over_contrast`: photometric error over the mean deviation of grey levels within a neighbourhood of pixels.
-`log_detector_distance`: the squared distance of the images' box from the detector's in seven standard deviations of
-both, plus 3.
+Each column is a logarithm. The argument of `log_halves_apart` is `DisparityProfile.halves_apart` plus 0.02: it is small
+if all halves of a car's pixels have one best disparity, as pixels of one surface do. The argument of
+`log_error_over_contrast` is the photometric error divided by the mean deviation of grey levels within a neighbourhood
+of pixels. The argument of `log_detector_distance` is the squared distance between the images' box and the detector's
+box in the standard deviations of both, over seven quantities, plus 3.
 """
 
-# Beyond this many standard deviations of the cars of the fit nothing was learnt: the figure there holds.
+# Evidence is clamped to this many standard deviations of the cars of the fit, because nothing was learnt beyond them.
 _KNOWN_SIGMAS = 3.0
 _NUM_SAMPLES = 256
 _DEGREES_OF_FREEDOM = 4
 
 
 class ImageNoise(NamedTuple):
-    """What images are off by in `CAR_QUANTITIES`: `sqrt((factor * sigma)^2 + floor^2)`, sigma uncalibrated."""
+    """The images' error in `CAR_QUANTITIES` is `sqrt((factor * sigma)^2 + floor^2)` with the uncalibrated sigma."""
 
     factors: tuple[float, ...]  # 7
     floors_m: tuple[float, ...]  # 7
 
     def covariance(self, uncalibrated: Tensor) -> Tensor:
-        """The covariance (B, 7, 7) of images whose uncalibrated one is given."""
+        """Calibrated covariance (B, 7, 7) of the images from the uncalibrated one."""
         factors, floors = (constant_like(x, uncalibrated) for x in self)
         return factors[:, None] * uncalibrated * factors + torch.diag(floors**2)
 
 
 @dataclass(frozen=True)
 class LogisticHead:
-    """`P = sigmoid(bias + sum_i weights_i clamp((evidence_i - means_i) / scales_i))`."""
+    """It computes `P = sigmoid(bias + sum_i weights_i clamp((evidence_i - means_i) / scales_i))`."""
 
-    means: tuple[float, ...]  # of `EVIDENCE_NAMES` over the cars of the fit
-    scales: tuple[float, ...]  # likewise
+    means: tuple[float, ...]  # means of `EVIDENCE_NAMES` over the cars of the fit
+    scales: tuple[float, ...]  # standard deviations of `EVIDENCE_NAMES` over the cars of the fit
     weights: tuple[float, ...]  # fitted
     bias: float
 
@@ -68,15 +69,15 @@ class LogisticHead:
         """Probabilities (B,) from the evidence (B, E); figures that do not exist count as the mean."""
         means, scales, weights = (constant_like(x, evidence) for x in (self.means, self.scales, self.weights))
         standard = ((evidence - means) / scales).clamp(-_KNOWN_SIGMAS, _KNOWN_SIGMAS)
-        # A product and a sum rather than a matrix product, an exponential rather than PyTorch's sigmoid, which rounds
-        # another way at the end of a batch: equal bits whatever its size.
+        # A product with a sum replaces the matrix product, and an exponential replaces PyTorch's sigmoid, because both
+        # round differently at the end of a batch. So the result is equal to the bit for every batch size.
         log_odds = self.bias + (torch.nan_to_num(standard, nan=0.0) * weights).sum(dim=1)
         return 1 / (1 + torch.exp(-log_odds))
 
 
 @dataclass(frozen=True)
 class TrustModel:
-    """Everything that was measured on cars with truth, by scripts/calibrate_trust.py."""
+    """This is everything that scripts/calibrate_trust.py has measured on cars with ground truth."""
 
     car_is_there: LogisticHead
     image_noise: ImageNoise
@@ -92,7 +93,7 @@ def trust_model_of(content: Mapping[str, Any]) -> TrustModel:
     """The model that `TrustModel.save` has written.
 
     Raises:
-        ValueError: it is that of another version.
+        ValueError: the content comes from another version.
     """
     if content["schema"] != SCHEMA:
         raise ValueError(f"schema {content['schema']!r}, this version reads {SCHEMA!r}")
@@ -105,7 +106,7 @@ def trust_model_of(content: Mapping[str, Any]) -> TrustModel:
 
 @cache
 def bundled_trust_model() -> TrustModel:
-    """The model that comes with the package; read at its first use."""
+    """The model that comes with the package; it is read at its first use."""
     return trust_model_of(json.loads(BUNDLED.read_text(encoding="utf-8")))
 
 
@@ -116,14 +117,16 @@ def probabilities(
     hwl: Tensor,
     turned: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Whether the returned box overlaps the true one more than the detector's does, and less by at most 0.05.
+    """Compute the probabilities that a returned box is better than the detector's box, and that it is not worse.
 
-    Two probabilities (B,). Overlaps are seen from above and fall with the errors by `exp(-loss)`.
+    The first probability (B,) is that the returned box overlaps the true box more than the detector's box does, the
+    second (B,) that its overlap is lower by at most 0.05. Overlaps are seen from above and fall with the errors by
+    `exp(-loss)`.
 
     Args:
-        returned: (B, 7) the returned box less the most probable one, `CAR_QUANTITIES`, metres.
-        detector: (B, 7) the detector's box less the most probable one.
-        covariance: (B, 7, 7) scales of Student's t of the true box about the most probable one.
+        returned: (B, 7) the returned box minus the most probable box, `CAR_QUANTITIES`, metres.
+        detector: (B, 7) the detector's box minus the most probable box.
+        covariance: (B, 7, 7) scales of Student's t of the true box around the most probable box.
         hwl: (B, 3) height, width and length of the car, metres.
         turned: (B,) angle from the viewing ray to the car's length, on the ground, radians.
     """
@@ -132,7 +135,7 @@ def probabilities(
     at_returned, at_detector = (
         torch.exp(-_loss(truth - box[:, None], hwl.to(truth), turned.to(truth))) for box in (returned, detector)
     )
-    # Equal boxes are as good as each other.
+    # Equal boxes give a probability of 0.5.
     better = 0.5 * (at_returned - at_detector).sign().mean(dim=1) + 0.5
     not_worse = (at_returned > at_detector - WORSE_BY).to(truth.dtype).mean(dim=1)
     known = (info == 0) & returned.isfinite().all(dim=1) & detector.isfinite().all(dim=1)
@@ -140,9 +143,10 @@ def probabilities(
 
 
 def _loss(error: Tensor, hwl: Tensor, turned: Tensor) -> Tensor:
-    """What errors (B, S, 7) of a box cost of its overlap (B, S), to first order.
+    """Loss of overlap (B, S) by errors (B, S, 7) of a box, to first order.
 
-    IoU falls by twice the shift over the side, by the corners cut in a turn, and by the change of a side over itself.
+    The IoU falls by twice the shift divided by the side, by the corners that a turn cuts, and by the relative change of
+    a side.
     """
     _, width, length = hwl.clamp_min(0.1)[:, :, None].unbind(dim=1)
     depth, sideways, _, heading, of_length, of_width, _ = error.unbind(dim=2)
@@ -156,7 +160,7 @@ def _loss(error: Tensor, hwl: Tensor, turned: Tensor) -> Tensor:
 def _student(dtype: torch.dtype, device: torch.device) -> Tensor:
     """Samples (2 S, 7) of Student's t of 4 degrees of freedom and scale 1, evenly spread over its probability."""
     engine = torch.quasirandom.SobolEngine(9)  # type: ignore[no-untyped-call]
-    # The first of its points is a corner, where the distribution is infinite.
+    # The first point of the Sobol sequence is a corner, where the distribution is infinite.
     uniform = engine.draw(_NUM_SAMPLES + 1, dtype=torch.float64)[1:]
     normal = math.sqrt(2) * torch.erfinv(2 * uniform[:, :7] - 1)
     # The sum of two exponential variables, twice, is chi-squared of 4 degrees of freedom.
