@@ -1,1 +1,1 @@
-"""What is known of a stereo rig and of the detector behind it, from every kind of evidence."""
+"""This package estimates from all evidence what is known of a stereo rig and of the detector that uses it."""

@@ -1,4 +1,4 @@
-"""What detections say of the rig: disparities on the near side of each car against those that its box implies."""
+"""This module compares measured disparities on the near side of each car with those that its box implies."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from directshape_torch.stereo_matching.disparity import rgb8
 from directshape_torch.stereo_matching.patch_alignment import MatchedPair
 
 _SETBACK_M = 0.1
-# Share of the box's height in which its sides are near the car's.
+# Within this range of the box's height the sides of the box are near the car's sides.
 _BAND = (0.2, 0.55)
 
 
@@ -26,12 +26,12 @@ def near_side_depth(
     uv_left: Tensor,  # (P, 2) pixels
     K_left: Tensor,  # (3, 3)
 ) -> Tensor:  # (P,)
-    """Depth at left pixels of the band of bumpers and doors, 10 cm within a box; NaN where a ray misses it."""
+    """Depth at left pixels of the band of bumpers and doors, 10 cm inside a box; NaN where a ray misses the band."""
     T_obj_cam, rays_cam = inverse(T_cam_obj), rays_from_pixels(uv_left, K_left)
     height, width, length = dimensions_hwl
     half = torch.stack([length / 2 - _SETBACK_M, height, width / 2 - _SETBACK_M])
     bounds = torch.stack([-half, half * half.new_tensor([1.0, 0.0, 1.0])])
-    # One block, of the rays of one camera.
+    # All rays of the camera form one block.
     rays_obj = ObjectRays(T_obj_cam[:3, 3, None, None], (rays_cam @ T_obj_cam[:3, :3].T).T[:, None])
     near, _, hit = (x[0] for x in rays_obj.interval(bounds)[:3])
     level = -transform(T_obj_cam, near[:, None] * rays_cam)[:, 1] / height
@@ -39,9 +39,11 @@ def near_side_depth(
     return torch.where(on_band, near, torch.nan)
 
 
-# Corners of roof, belt, bumpers and wheels in lengths, heights and widths of a box; either side, either end.
+# These are the corners of roof, belt, bumpers and wheels in lengths, heights and widths of a box. They hold for both
+# sides and both ends.
 _CORNERS = ((0.20, -1.0, 0.36), (0.46, -0.62, 0.46), (0.48, -0.35, 0.50), (0.38, 0.0, 0.46))
-# Height of masks over that of these corners, in the median over true boxes: 0.975 rendered, 0.970 and 0.983 on KITTI.
+# This is the height of a mask divided by the height of the projected corners. Its median over true boxes is 0.975 in
+# rendered images, and 0.970 and 0.983 on KITTI.
 _MASK_OVER_CORNERS = 0.977
 _MASK_BORDER_PX = 2
 _LARGEST_SIZE_ERROR = 0.2
@@ -54,9 +56,10 @@ def size_error(
     mask: Tensor,  # (H, W) bool
     K_left: Tensor,  # (3, 3)
 ) -> float:
-    """Relative error of the box's depth by the height of its mask, above 0 where it stands too far.
+    """Estimate the relative error of the box's depth from the height of its mask; it is above 0 for a box too far away.
 
-    It is 0 where it is not known: the image ends there, the mask is small, or something hides or extends it (20 %).
+    The result is 0 if the error is not known: the mask touches the border of the image, is small, or gives an error of
+    20 % or more, which means that something hides or extends it.
     """
     v, u = mask.nonzero().unbind(dim=1)
     height, width = mask.shape
@@ -72,30 +75,32 @@ def size_error(
     return error if abs(error) < _LARGEST_SIZE_ERROR else 0.0
 
 
-# A reduced observation, pixels: place in the left image, measured disparity (`Rig.of_depth`), the same less the implied
-# one and its standard deviation by the car's own spread, measured less predicted row and its standard deviation; and
-# the relative error of the box's depth by the size of its mask, 0 where it is not known.
+# These are the columns of a reduced observation, in pixels: place in the left image, measured disparity
+# (`Rig.of_depth`), measured minus implied disparity and its standard deviation by the car's own spread, measured minus
+# predicted row and its standard deviation. The last column is the relative error of the box's depth by the size of its
+# mask, and 0 if it is not known.
 COLUMNS = ("u", "v", "disparity", "offset", "sigma", "row_offset", "row_sigma", "size_error")
 
 _NEAREST_M, _FARTHEST_M = 5.0, 70.0
 _POINTS_PER_CAR = 400
 _FEWEST_POINTS = 20
-# Neighbouring patches overlap: so many pixels count as one measurement.
+# Neighbouring patches overlap, so this many pixels count as one measurement.
 _POINTS_OF_ONE_PATCH = 20
-# A side's own relief and a heading that is off spread the offsets of one car; more is another thing in its place.
+# The relief of a side and a wrong heading spread the offsets of one car. A larger spread means that another object is
+# in its place.
 _LARGEST_SPREAD_M, _LARGEST_SPREAD_PX = 0.5, 0.7
-# No detector is that far off: units, frames or the car itself are others.
+# No detector is farther off than this. Larger offsets mean wrong units, wrong frames or another car.
 _LARGEST_OFFSET_PX, _LARGEST_SHARE = 2.0, 0.4
-# How far the side of one car may lie from where its box, whose dimensions are guesses, has it.
+# This is the standard deviation between the side of a car and the side of its box, whose dimensions are guesses.
 _SURFACE_SIGMA_M = 0.15
-_TO_SIGMA = 1.4826  # of a median absolute deviation
+_TO_SIGMA = 1.4826  # sigma over the median absolute deviation
 _MEDIAN_TO_MEAN = 1.57  # variance of a median over that of a mean
 
 
 def observe_detections(frames: FrameBatch, detections: Detections) -> Tensor:  # (N, 8)
-    """One row (`COLUMNS`, float64, CPU) for each car 5 to 70 m ahead whose near side is matched consistently.
+    """Make one row (`COLUMNS`, float64, CPU) for each car 5 to 70 m ahead whose near side is matched consistently.
 
-    A disparity field of the camera is not used; of a car with a left mask only the pixels of the mask are looked at.
+    A disparity field of the camera is not used. If a car has a left mask, only the pixels of the mask are used.
     """
     rows = [row for frame in range(len(frames)) for row in _rows_of_frame(frames, detections, frame)]
     return torch.stack(rows) if rows else torch.zeros(0, len(COLUMNS), dtype=torch.float64)
@@ -136,7 +141,7 @@ def _row_of_car(detections: Detections, car: int, pair: MatchedPair, rig: Rig) -
 
 
 def _pixels_of_car(detections: Detections, car: int, T_cam_obj: Tensor, hwl: Tensor, rig: Rig) -> Tensor:
-    """(H, W) the car's mask; without a mask the pixels round its box."""
+    """The car's mask (H, W), or the pixels in the rectangle around its box if there is no mask."""
     width, height = rig.size_wh
     if bool(detections.has_mask_left[car]):
         return detections.mask_left[car][:height, :width].detach().cpu() > MASK_THRESHOLD
@@ -155,7 +160,7 @@ def _reduced(
     row_offset: Tensor,  # (P,)
     focal_baseline: Tensor,  # () pixels x metres
 ) -> Tensor | None:
-    """The car's medians, or None where its pixels are few or contradict each other."""
+    """The medians of the car, or None if its pixels are few or contradict each other."""
     if len(uv) < _FEWEST_POINTS:
         return None
     middle = disparity.median()

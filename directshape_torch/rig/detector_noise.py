@@ -1,8 +1,9 @@
-"""What a detector is off by, from how far refined cars lie from its boxes beyond what the images are off by themselves.
+"""This module estimates a detector's errors from the differences between refined cars and its boxes.
 
-Empirical Bayes: each standard deviation is that of a Student-t distribution of the differences, whose variance has the
-images' added, averaged over a grid with a prior of what detectors have, from LiDAR to one camera. A detector that is
-good at one quantity is good at the others: a common factor lets seven quantities of a few cars tell what it is.
+The method is empirical Bayes. The differences have a Student-t distribution, whose variance is the sum of the variances
+of detector and images. Each standard deviation of the detector is averaged over a grid, with a prior that covers
+detectors from LiDAR to one camera. A detector that is good at one quantity is mostly good at the others. Therefore a
+common factor joins the seven quantities, so that a few cars show how good the detector is.
 """
 
 from __future__ import annotations
@@ -17,27 +18,27 @@ if TYPE_CHECKING:
     from directshape_torch.refinement.fusion import DetectorComparison
 
 NUM_COLUMNS = 15
-"""The number of columns of the rows that `rows_of` makes."""
+"""This is the number of columns of the rows that `rows_of` makes."""
 
-# What the standard deviations of detectors are: their middle, and the spread of their logarithm. That of the depth is a
-# share of the distance; sideways position, height above ground, heading (times 2 m), length, width and height are
-# metres.
+# The prior of the detectors' standard deviations has this middle and this spread of the logarithm. The standard
+# deviation of the depth is a share of the distance. Sideways position, height above ground, heading (times 2 m),
+# length, width and height are in metres.
 _MIDDLE = (0.02, 0.12, 0.06, 0.16, 0.35, 0.08, 0.08)
 _SPREAD = (1.2, 0.8, 0.6, 1.0, 0.5, 0.5, 0.5)
-# Standard deviations that are tried, as multiples of the middle.
+# The grid of standard deviations holds these multiples of the middle.
 _TRIED = torch.linspace(-4, 3, 71, dtype=torch.float64).exp()
 _DEGREES_OF_FREEDOM = 4
-# How good a detector is, in standard deviations of detectors, and the share of the spreads that it explains. With less
-# of it, single frames do not tell LiDAR from a camera.
+# The common factor takes these values, in standard deviations of detectors, and explains this share of the spreads.
+# With a smaller share single frames cannot distinguish LiDAR from a camera.
 _FACTORS = torch.linspace(-3, 3, 25, dtype=torch.float64)
 _COMMON_SHARE = 0.8
-# Results keep something of their start, and the energy holds shapes to the detector's dimensions, so that no more than
-# this share of what a detector is off by shows.
+# Results keep something of their start, and the energy holds shapes to the detector's dimensions. Therefore the
+# differences show only this share of the detector's errors.
 _SHOWN = (0.77, 0.77, 0.77, 0.77, 0.5, 0.5, 0.5)
 
 
 def rows_of(comparison: DetectorComparison) -> Tensor:
-    """A row (N, 15) for each car that was compared: distance (metres), seven differences, seven standard deviations."""
+    """Rows (N, 15) of compared cars: distance in metres, seven differences, seven standard deviations."""
     parts = comparison.distance[:, None], comparison.difference, comparison.sigma_images
     rows = torch.cat(parts, dim=1).detach()
     return rows[rows.isfinite().all(dim=1)].cpu()
@@ -46,7 +47,8 @@ def rows_of(comparison: DetectorComparison) -> Tensor:
 def detector_sigmas(
     rows: Tensor,  # (N, 15) float64
 ) -> Tensor:  # (7,)
-    """Standard deviations of the detector in `CAR_QUANTITIES`: of the depth as a share of the distance, else metres.
+    """Estimate the detector's standard deviations in `CAR_QUANTITIES`: a share of the distance for the depth, else
+    metres.
 
     Examples:
         >>> noise = torch.randn(500, 7, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -62,7 +64,7 @@ def detector_sigmas(
     variance = (noise[:, None] * units) ** 2 + sigma**2
     nu = _DEGREES_OF_FREEDOM
     log_likelihood = -0.5 * (variance.log() + (nu + 1) * torch.log1p(difference**2 / variance / nu)).sum(dim=1)
-    # (S, 1, 7) and (1, C, 1): the standard deviations that are tried, given how good the detector is.
+    # The standard deviations of the grid (S, 1, 7) have a prior that depends on the common factor (C, 1).
     standard, factor = ((noise / middle).log() / spread)[:, None], _FACTORS[:, None]
     log_prior = -0.5 * (standard - math.sqrt(_COMMON_SHARE) * factor) ** 2 / (1 - _COMMON_SHARE)
     joint = log_likelihood[:, None] + log_prior.log_softmax(dim=0)

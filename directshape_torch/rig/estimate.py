@@ -1,4 +1,4 @@
-"""`RigEstimate`: what is known of one stereo rig and of the detector behind it, from all evidence so far."""
+"""`RigEstimate` holds what is known of one stereo rig and of its detector, from all evidence so far."""
 
 from __future__ import annotations
 
@@ -25,37 +25,38 @@ from directshape_torch.scene import Detections, FrameBatch
 if TYPE_CHECKING:
     from directshape_torch.refinement.result import RefinementResult
 
-# A service runs for years; so many cars say all that cars can say.
+# A service may run for years, but more cars than this say nothing new.
 _MOST_ROWS = 1000
-# Fewer hardly show a field: the prior decides, and rigs like KITTI's are farther off than it expects.
+# Fewer detections hardly show a field. The prior decides then, and rigs such as KITTI's are farther off than it
+# expects.
 _FEWEST_DETECTIONS = 30
 
-# No image is wider, and the powers of larger numbers leave a sum no digits.
+# No image is wider than this, and powers of larger numbers would exhaust the digits of a sum.
 _LARGEST_PX = 1e5
-# Half of a car's image: where it stands the field is seen.
+# This is half the size of a car's image. The field is seen in the whole image of a car.
 _CAR_UV_PX = (40.0, 20.0)
 _SQUARE, _LONG = (NUM_COEFFICIENTS, NUM_COEFFICIENTS), (NUM_COEFFICIENTS,)
-# What content that is missing, of other types or sizes, too large or too deep leads to.
+# These errors come from content that is missing, has other types or sizes, or is too large or too deep.
 DAMAGE = (AttributeError, KeyError, IndexError, TypeError, ValueError, OverflowError, RuntimeError)
 _OF_PIXELS = (_SQUARE, _LONG, _SQUARE, _LONG, (None, 2))
 
 
 class Detector(NamedTuple):
-    """How the detections differ from the disparities."""
+    """This says how the detections differ from the disparities."""
 
-    bias: float  # of the depth, relative; above 0 where boxes stand too far
+    bias: float  # relative bias of the depth; above 0 if boxes stand too far away
     bias_sigma: float
     noise: float  # standard deviation of the depth, relative
     num_cars: int
 
 
 class RigEstimate(nn.Module):
-    """The rig's disparity field and the detector's depth error, estimated from the detections themselves and from
-    whatever else is known (docs/derivations/rig.md).
+    """This estimates the rig's disparity field and the detector's depth error from all evidence
+    (docs/derivations/rig.md).
 
-    It keeps the evidence: one row a car, and sums over pixels of known depth. So it does not matter in which order or
-    in how many portions frames come. All of it stays on the CPU in float64, in the `state_dict` as extra state; fields
-    go to the device of whoever asks them.
+    It keeps the evidence: one row for each car, and sums over pixels of known depth. So order and portions of the
+    frames do not matter. The evidence stays on the CPU in float64, and in the `state_dict` as extra state. A field
+    moves to the device of the tensors that it is asked for.
 
     Args:
         size_wh: width and height of the rig's images.
@@ -84,15 +85,15 @@ class RigEstimate(nn.Module):
 
     @classmethod
     def of_frames(cls, frames: FrameBatch) -> Self:
-        """Of the rig of the first of some frames, nothing known yet."""
+        """Make an estimate without evidence for the rig of the first of some frames."""
         return cls(*Rig.of_frame(frames))
 
     def update(self, frames: FrameBatch, detections: Detections) -> None:
-        """Take in what the detections of further frames say.
+        """Add the evidence of the detections of further frames.
 
         Args:
-            frames: of this rig; of a frame that was taken in before nothing is counted again.
-            detections: of any detector, always the same; left masks help.
+            frames: frames of this rig. A frame that was added before does not count again.
+            detections: detections of one detector in all calls; left masks help.
 
         Raises:
             InputError: frames of another rig.
@@ -101,7 +102,7 @@ class RigEstimate(nn.Module):
         self.add_rows(observe_detections(frames, detections))
 
     def add_rows(self, rows: Tensor) -> None:
-        """Take in reduced observations of detections, (N, 8) `rig.detections.COLUMNS`, else `InputError`."""
+        """Add reduced observations (N, 8) of detections in `rig.detections.COLUMNS`; others raise `InputError`."""
         check_shape("rows", rows, ("N", len(COLUMNS)), kind="floating")
         largest = float(rows.detach().abs().amax()) if len(rows) else 0.0
         if not largest <= _LARGEST_PX:
@@ -109,16 +110,16 @@ class RigEstimate(nn.Module):
         self.rows, self._solved = _kept_rows(torch.cat([self.rows, rows.detach().to(self.rows)])), None
 
     def add_pixels(self, kind: str, evidence: PixelEvidence) -> None:
-        """Take in pixels of known depth: `kind` is "lidar", "disparity" or "motion"."""
+        """Add pixels of known depth; `kind` is "lidar", "disparity" or "motion"."""
         before = self.pixels.get(kind)
         self.pixels[kind], self._solved = evidence if before is None else before + evidence, None
 
     def learn(self, frames: FrameBatch, result: RefinementResult) -> None:
-        """Take in how far refined cars lie from the detector's boxes, which says what these are off by.
+        """Add how far refined cars lie from the detector's boxes, which shows the detector's errors.
 
         Args:
-            frames: of this rig.
-            result: of a refiner with this estimate, of these frames; the same again says nothing new.
+            frames: frames of this rig.
+            result: result of a refiner with this estimate for these frames. A repeated result does not count again.
 
         Raises:
             InputError: frames of another rig.
@@ -132,10 +133,10 @@ class RigEstimate(nn.Module):
             self._blank.check_rig(*Rig.of_frame(frames, number))
 
     def add_results(self, rows: Tensor) -> None:
-        """Take in comparisons of results with detections, (N, 15) as `detector_noise.rows_of` makes them.
+        """Add comparisons (N, 15) of results with detections, as `detector_noise.rows_of` makes them.
 
         Raises:
-            InputError: another shape, or numbers that are none of a comparison.
+            InputError: wrong shape, or numbers that no comparison has.
         """
         check_shape("rows", rows, ("N", detector_noise.NUM_COLUMNS), kind="floating")
         if not bool(rows.isfinite().all()) or bool((rows[:, 8:] <= 0).any()):
@@ -143,22 +144,22 @@ class RigEstimate(nn.Module):
         self.results = _kept_rows(torch.cat([self.results, rows.detach().to(self.results)]))
 
     def detector_sigmas(self) -> Tensor | None:
-        """Standard deviations (7,) of the detector, see `refinement.fusion.fused`; None where no results are known."""
+        """Standard deviations (7,) of the detector, see `refinement.fusion.fused`; None if no results are known."""
         return detector_noise.detector_sigmas(self.results) if len(self.results) else None
 
     @property
     def mean(self) -> Tensor:
-        """(12,) coefficients of the field (pixels), relative depth bias of the detector, its setback (metres)."""
+        """Mean (12,): field coefficients (pixels), relative depth bias of the detector, its setback (metres)."""
         return self._solve()[0].mean
 
     @property
     def covariance(self) -> Tensor:
-        """(12, 12), of `mean`."""
+        """Covariance (12, 12) of `mean`."""
         return self._solve()[0].covariance
 
     @property
     def detector(self) -> Detector:
-        """Bias and noise of the detector's depths; without detections those of the prior."""
+        """Bias and noise of the detector's depths; without detections the prior gives them."""
         found = self._solve()[0]
         sigma = float(found.covariance[BIAS, BIAS].sqrt())
         return Detector(float(found.mean[BIAS]), sigma, found.depth_noise, len(self.rows))
@@ -172,18 +173,18 @@ class RigEstimate(nn.Module):
         self,
         uv_left: Tensor,  # (*, 2) pixels of the left image
     ) -> tuple[Tensor, Tensor]:  # (*,), (*,)
-        """Measured less true disparity, beyond the data that of the nearest ones, and its deviation (pixels)."""
+        """Measured minus true disparity and its standard deviation, pixels; beyond the data the nearest data decide."""
         return self.field.bias(uv_left), self.field.sigma(uv_left)
 
     def in_the_middle(self) -> tuple[float, float]:
-        """Offset and its standard deviation, pixels, at the median place of the cars; without any at the centre."""
+        """Offset and its standard deviation, pixels, at the median place of the cars, or at the centre without cars."""
         width, height = self._blank.size_wh
         centre = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64)
         mean, sigma = self.offset_at(self.rows[:, :2].median(dim=0).values if len(self.rows) else centre)
         return float(mean), float(sigma)
 
     def corrected(self, frames: FrameBatch) -> FrameBatch:
-        """Frames whose camera has the estimated field; those that bring a field of their own keep it.
+        """Frames whose camera has the estimated field; frames that bring a field of their own keep it.
 
         Raises:
             InputError: frames of another rig.
@@ -193,15 +194,16 @@ class RigEstimate(nn.Module):
         return replace(frames, camera=replace(frames.camera, disparity_field=self.field))
 
     def informed(self, frames: FrameBatch, detections: Detections) -> Detections:
-        """Detections that say what is not known of the detector's depths and of the rig, where they do not yet.
+        """Detections with standard deviations of the detector's depths and of the rig's offset, where they bring none.
 
-        What the detector is off by in the mean counts as much as its noise: the prior stays where the box is. A field
-        that is a guess leaves each car an unknown offset, so that contours and box have a say in its depth. The sigma
-        of a better one widens what the result says of its depth and does not move it: contours would know less.
+        The bias of the detector adds to its standard deviation, and the prior stays at the box. If the field is a
+        guess, each car gets an unknown offset, so that contours and box influence its depth. The sigma of a better
+        known field widens the standard deviation of the result's depth and does not change the depth, because such a
+        field knows more than contours.
 
         Args:
-            frames: corrected; what is said of the rig concerns those with this estimate's field.
-            detections: of these frames.
+            frames: corrected frames. An offset is added only if they have the field of this estimate.
+            detections: detections of these frames.
         """
         origin = detections.T_cam_obj.detach()[:, :3, 3]
         said: dict[str, Tensor] = {}
@@ -211,13 +213,13 @@ class RigEstimate(nn.Module):
             said["pose_sigma"][:, 0] = torch.where(along > 0, along, torch.inf)
         if detections.offset_sigma_px is None and self.is_guess and self._is_own(frames.camera.disparity_field):
             sigma = frames.camera.field_sigma_px(detections.frame_index, origin)
-            # A box that is nowhere fails by itself.
+            # A box without a finite place is refused elsewhere.
             said["offset_sigma_px"] = sigma.nan_to_num(nan=0.0)
         return replace(detections, **said) if said else detections  # type: ignore[arg-type]
 
     @property
     def is_guess(self) -> bool:
-        """Whether the field is hardly more than the prior: from fewer than 30 detections, and no other evidence."""
+        """Whether the field is hardly more than the prior: it has fewer than 30 detections and no other evidence."""
         return len(self.rows) < _FEWEST_DETECTIONS and not self.pixels
 
     def _is_own(self, field: DisparityField | None) -> bool:
@@ -227,7 +229,7 @@ class RigEstimate(nn.Module):
         return torch.equal(field.coefficients.cpu(), own)
 
     def __str__(self) -> str:
-        """One line of what was found and from what."""
+        """Say in one line what was found and from which evidence."""
         (offset, sigma), detector = self.in_the_middle(), self.detector
         sources = [f"{len(self.rows)} detections"] if len(self.rows) else []
         sources += [f"{kind} ({e.num_frames} frames)" for kind, e in sorted(self.pixels.items())]
@@ -247,11 +249,11 @@ class RigEstimate(nn.Module):
         return f"  at v = {v:.0f}: " + ", ".join(f"u {at:.0f}: {m:+.2f} +- {s:.2f}" for at, m, s in known)
 
     def metres_per_pixel(self, depth_m: float) -> float:
-        """By how much a pixel of disparity moves a point of that depth."""
+        """Change in depth, in metres, of a point at `depth_m` for one pixel of disparity."""
         return depth_m**2 / self._focal_baseline
 
     def is_of(self, size_wh: tuple[int, int], K_left: Tensor, K_right: Tensor, T_right_cam: Tensor) -> bool:
-        """Whether this is the rig of such frames."""
+        """Whether frames with this size and these matrices come from the rig."""
         try:
             self._blank.check_rig(size_wh, K_left, K_right, T_right_cam)
         except InputError:
@@ -259,7 +261,7 @@ class RigEstimate(nn.Module):
         return True
 
     def content(self) -> dict[str, Any]:
-        """All that the estimate rests on, for JSON; `of_content` takes it back."""
+        """All evidence of the estimate, for JSON; `of_content` reads it back."""
         size_wh, *matrices = (list(part) if isinstance(part, tuple) else part.tolist() for part in self._blank.rig)
         pixels = {kind: {n: _plain(x) for n, x in sums._asdict().items()} for kind, sums in self.pixels.items()}
         rig = dict(zip(("K_left", "K_right", "T_right_cam"), matrices, strict=True))
@@ -268,7 +270,7 @@ class RigEstimate(nn.Module):
 
     @classmethod
     def of_content(cls, content: Any) -> Self:
-        """The estimate that `content` was made of; raises `InputError` for what is no such content."""
+        """The estimate whose `content()` is given; other contents raise `InputError`."""
         try:
             width, height = (int(n) for n in content["size_wh"])
             sizes = {"K_left": 3, "K_right": 3, "T_right_cam": 4}
@@ -285,11 +287,11 @@ class RigEstimate(nn.Module):
         return rig
 
     def get_extra_state(self) -> Tensor:
-        """`content` as the bytes of JSON; `set_extra_state` takes it back."""
+        """`content` as bytes of JSON; `set_extra_state` reads it back."""
         return torch.tensor(list(json.dumps(self.content()).encode()), dtype=torch.uint8)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Of `get_extra_state`, else `InputError`; nothing of what was known before stays."""
+        """Replace all evidence by the state from `get_extra_state`; other states raise `InputError`."""
         check_shape("state", state, ("n",))
         try:
             other = self.of_content(json.loads(bytes(state.tolist())))
@@ -322,7 +324,7 @@ class RigEstimate(nn.Module):
         return self._solved
 
     def _hull(self) -> Tensor:
-        """Round all data; the whole image where there are none, for the field is level then."""
+        """Hull (M, 2) of all data, or the whole image if there are no data, because the field is constant then."""
         around = torch.tensor([[-1.0, -1.0], [1, -1], [1, 1], [-1, 1]]).double() * torch.tensor(_CAR_UV_PX).double()
         corners = [(self.rows[:, None, :2] + around).reshape(-1, 2), *(e.hull_uv for e in self.pixels.values())]
         uv = torch.cat(corners)
@@ -330,12 +332,12 @@ class RigEstimate(nn.Module):
 
 
 def to_tensor(entry: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) -> Tensor:
-    """The numbers of that name in the content of a JSON file, float64, else `ValueError`; None is any size."""
+    """Numbers by name in the content of a JSON file, float64, else `ValueError`; None in `shape` is any size."""
     try:
         tensor = torch.tensor(entry[name], dtype=torch.float64)
     except DAMAGE as error:
         raise ValueError(f"{name!r} must be numbers of shape {shape}") from error
-    if not tensor.numel() and None in shape:  # JSON has no rows of nothing
+    if not tensor.numel() and None in shape:  # an empty list in JSON has no columns
         tensor = tensor.reshape([n or 0 for n in shape])
     fits = tensor.ndim == len(shape) and all(n is None or n == m for n, m in zip(shape, tensor.shape, strict=True))
     if not fits or not bool(tensor.isfinite().all()):
@@ -344,7 +346,7 @@ def to_tensor(entry: Mapping[str, Any], name: str, shape: tuple[int | None, ...]
 
 
 def _kept_rows(rows: Tensor) -> Tensor:
-    """At most 1000 of the rows, each once: the same ones, in the same order, however and how often they came."""
+    """At most 1000 different rows; neither choice nor order depends on how and how often the rows came."""
     rows = rows.unique(dim=0)  # type: ignore[no-untyped-call]
     key = (rows[:, :4] * rows.new_tensor([0.754877, 0.569840, 0.430159, 0.324718])).sum(dim=1) % 1
     return rows[key.argsort()[:_MOST_ROWS]]

@@ -1,4 +1,4 @@
-"""Evidence on rigs from files: detections of a data set, disparity maps or LiDAR, consecutive frames."""
+"""This module collects evidence on rigs from files: detections, disparity maps, LiDAR or consecutive frames."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ from directshape_torch.rig.self_calibration import FieldConstraint, find_road
 from directshape_torch.stereo_matching.patch_alignment import MatchedPair
 
 TruthSource = Literal["disparity", "lidar"]
-Frame = tuple[Rig, Tensor]  # and observations (P, 4), see `observe_disparity`
+Frame = tuple[Rig, Tensor]  # a rig and its observations (P, 4), see `observe_disparity`
 
-# Half a second each, and an estimate from detections hardly gets better than that.
+# A frame takes half a second, and more frames hardly improve an estimate from detections.
 _MOST_FRAMES = 60
 _SIGMA_PX = 0.06
 _DEPTH_RANGE_M = (3.0, 80.0)
-# The scanner stands higher than the camera and looks over things. A point is hidden where a neighbour within this many
-# pixels is nearer by this much disparity; on a level road five rows are 1.6 px.
+# The scanner stands higher than the camera and looks over objects. A point is hidden if a neighbour within this many
+# pixels is nearer by this much disparity. On a level road five rows make 1.6 px.
 _WINDOW_PX = 5
 _HIDDEN_BY_PX = 2.5
 
@@ -50,11 +50,11 @@ def estimate_rigs(
     tell: Callable[[str], object] = lambda _: None,
     rigs: list[RigEstimate] | None = None,
 ) -> list[RigEstimate]:
-    """One estimate for each calibration among the frames of a data set, whichever of them are chosen.
+    """Make one estimate for each calibration among all frames of a data set, whether they are chosen or not.
 
-    Frames with cars are taken evenly from all of them, at most 60 a rig, until the field is known to 0.06 px in the
-    middle of the cars. What cannot be read is passed over: it is reported when its turn comes. The evidence is added to
-    the `rigs` that are known already, and new ones join the list; `tell` gets the name of each frame.
+    Frames with cars are taken evenly from all frames, at most 60 for each rig, until the field is known to 0.06 px in
+    the middle of the cars. Files that cannot be read are skipped here; the refinement reports them later. The evidence
+    is added to the known `rigs`, and new rigs join the list. `tell` gets the name of each frame.
     """
     plain, rigs = replace(dataset, ground="camera_height", disparity_fields=()), [] if rigs is None else rigs
     for frame_ids in _frames_by_rig(plain):
@@ -63,7 +63,7 @@ def estimate_rigs(
 
 
 def _frames_by_rig(dataset: StereoDataset) -> list[list[str]]:
-    """All frames, chosen or not, those of one calibration together; those whose calibration cannot be read drop out."""
+    """All frames grouped by calibration, without those whose calibration cannot be read."""
     groups: dict[bytes, list[str]] = {}
     for frame_id in dict.fromkeys([*dataset.layout.frame_ids(), *dataset.frame_ids]):
         with suppress(DirectShapeError, OSError):
@@ -91,7 +91,7 @@ def _take_in(
 
 
 def _rig_of_first(dataset: StereoDataset, frame_ids: Sequence[str], rigs: list[RigEstimate]) -> RigEstimate | None:
-    """That of the first frame whose left image can be read; a rig whose frames have no cars is one too."""
+    """The rig of the first frame whose left image can be read; the frames need not have cars."""
     for frame_id in frame_ids:
         with suppress(DirectShapeError, OSError):
             files = dataset.layout.files(frame_id)
@@ -102,13 +102,13 @@ def _rig_of_first(dataset: StereoDataset, frame_ids: Sequence[str], rigs: list[R
 
 
 def evenly(frame_ids: Sequence[str]) -> list[str]:
-    """All of them, so that the first N are spread over the whole: in the order of their bit-reversed numbers."""
+    """All frames in the order of their bit-reversed numbers, so that the first N are spread over the whole."""
     num_bits = max(1, (len(frame_ids) - 1).bit_length())
     return [frame_ids[k] for k in sorted(range(len(frame_ids)), key=lambda k: f"{k:0{num_bits}b}"[::-1])]
 
 
 def truth_files(root: Path, source: TruthSource) -> dict[str, Path]:
-    """The files of a source by frame id; of a stereo pair 2015 the first image (`NNNNNN_10`) keeps its full name."""
+    """Files of a source by frame id; the id of a first image of KITTI stereo 2015 is its full name `NNNNNN_10`."""
     folders, ending = (("disp_noc_0", "disp_occ_0"), ".png") if source == "disparity" else (("velodyne",), ".bin")
     found = (path for folder in folders for path in visible_files(root / "training" / folder, [ending]))
     files = {path.stem: path for path in found}
@@ -128,7 +128,7 @@ def observe_frame(files: FrameFiles, truth: Path, source: TruthSource) -> Frame:
 
 
 def add_truth(rigs: list[RigEstimate], source: TruthSource, frames: Sequence[Frame]) -> None:
-    """The evidence of observed frames to the estimates of their rigs; new rigs join the list."""
+    """Add the evidence of observed frames to the estimates of their rigs; new rigs join the list."""
     of_rig: dict[RigEstimate, list[Frame]] = {}
     for frame in frames:
         of_rig.setdefault(rig_among(rigs, frame[0]), []).append(frame)
@@ -138,7 +138,7 @@ def add_truth(rigs: list[RigEstimate], source: TruthSource, frames: Sequence[Fra
 
 
 def known_depth_from_lidar(path: Path, calibration: KittiCalibration, rig: Rig) -> Tensor:
-    """Scan points (P, 3) u, v, depth that fall into the left image and are not hidden from the camera."""
+    """Scan points (P, 3) in the left image that are not hidden from the camera: u, v, depth."""
     points_cam = read_scan(path, calibration)
     points_cam = points_cam[(points_cam[:, 2] > _DEPTH_RANGE_M[0]) & (points_cam[:, 2] < _DEPTH_RANGE_M[1])]
     known = torch.cat([project(points_cam, rig.K_left), points_cam[:, 2:]], dim=1)
@@ -148,7 +148,7 @@ def known_depth_from_lidar(path: Path, calibration: KittiCalibration, rig: Rig) 
 
 
 def _of_map(path: Path, rig: Rig) -> Tensor:
-    """Pixels (P, 3) u, v, depth whose true disparity is known."""
+    """Pixels (P, 3) with known true disparity: u, v, depth."""
     disparity = torch.from_numpy(read_disparity(path, (rig.size_wh[1], rig.size_wh[0]))).double()
     v, u = torch.nonzero(disparity.isfinite(), as_tuple=True)
     uv = torch.stack([u, v], dim=-1).double()
@@ -157,7 +157,7 @@ def _of_map(path: Path, rig: Rig) -> Tensor:
 
 
 def _hidden(uv: Tensor, disparity: Tensor, size_wh: tuple[int, int]) -> Tensor:
-    """Whether (P,) a much nearer point lies close by in the image."""
+    """Whether (P,) a much nearer point lies close to each point in the image."""
     import cv2
 
     column, row = uv[:, 0].round().long().numpy(), uv[:, 1].round().long().numpy()
@@ -177,12 +177,12 @@ def open_sequence(root: Path, frames: Sequence[int | str] | None = None) -> dict
     layout = tracking_layout(root, root)
     known = layout.image_ids()
     chosen = known if frames is None else frames_among(known, frames, "ids of images")
-    # Numbers with and without leading zeros.
+    # The order holds for numbers with and without leading zeros.
     found = {frame_id: layout.files(frame_id) for frame_id in sorted(chosen, key=lambda name: (len(name), name))}
     if len({layout.sequence_of(frame_id) for frame_id in found}) > 1 or len(found) < 2:
         cure = "give the folder of one sequence, and more frames"
         raise InputError("frames", "at least two consecutive frames of one sequence", str(len(found)), cure)
-    # Now rather than after minutes of work on the frames before it.
+    # A missing image is reported now, before minutes of work on other frames.
     if lonely := [frame_id for frame_id, files in found.items() if not files.right.is_file()]:
         cure = "add the right image of every frame, or leave frames out with --frames"
         raise DataFormatError(root / "image_03", f"has no image of {', '.join(lonely[:5])}", cure=cure)
@@ -190,7 +190,7 @@ def open_sequence(root: Path, frames: Sequence[int | str] | None = None) -> dict
 
 
 def gaps(frame_ids: Sequence[str]) -> list[tuple[str, str]]:
-    """Neighbours whose numbers are farther apart than those of the closest pair; none where ids are no numbers."""
+    """Neighbours whose numbers are farther apart than the closest pair's; none if an id is not a number."""
     if not all(frame_id.isdecimal() for frame_id in frame_ids):
         return []
     pairs = {(before, after): int(after) - int(before) for before, after in pairwise(frame_ids)}
@@ -198,9 +198,9 @@ def gaps(frame_ids: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def observe_motion(frames: Iterable[FrameFiles], height_m: float | None) -> list[FieldConstraint]:
-    """Read frames of one rig one after the other and collect what they show; without a camera height not of the road.
+    """Read frames of one rig one after the other and collect constraints; those of the road need `height_m`.
 
-    An iterator may show progress.
+    The caller may pass an iterator that shows progress.
     """
     constraints: list[FieldConstraint] = []
     waiting: deque[StereoFeatures] = deque(maxlen=max(STEPS) + 1)
@@ -218,13 +218,13 @@ def observe_motion(frames: Iterable[FrameFiles], height_m: float | None) -> list
         waiting.append(find_features(left, pair, rig))
         if len(waiting) == waiting.maxlen:
             constraints += _of_first(waiting)
-    # The last frames have fewer that follow them.
+    # Fewer frames follow the last ones.
     while waiting:
         constraints += _of_first(waiting)
     return constraints
 
 
 def _of_first(waiting: deque[StereoFeatures]) -> Sequence[FieldConstraint]:
-    """The first frame is taken away and found again in those that follow it."""
+    """Remove the first frame and find its points in the frames that follow it."""
     first = waiting.popleft()
     return track_features(first, [features.grey_left for features in waiting])

@@ -1,9 +1,10 @@
-"""Still things seen twice by a moving rig as a constraint on the field.
+"""This module turns still objects that a moving rig sees twice into a constraint on the field.
 
 The left images of two frames alone give the camera's motion and the depth of every point, up to one common factor.
-Stereo gives the same depths with the rig's bias on them. So `measured disparity = s * (depth from motion)^-1 +
-bias(u, v)`, the factor s free: points of different depth in the same part of the image separate the two. What trades
-with the factor is a wrong baseline, and on a road the field's slope along v, which the camera's height decides.
+Stereo also gives these depths, but with the bias of the rig. So `measured disparity = s * (depth from motion)^-1 +
+bias(u, v)` with a free factor s. Points of different depth in one part of the image separate s from the bias. A wrong
+baseline cannot be separated from s, and on a road neither can the field's slope along v, which the camera's height
+decides.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from directshape_torch.rig.rig import Rig
 from directshape_torch.rig.self_calibration import PATCH_SIGMA_PX, FieldConstraint
 from directshape_torch.stereo_matching.patch_alignment import MatchedPair, PatchLimits, align_patches
 
-# Later frames to which points are followed. One step shows the near points best, several the far ones.
+# Points are followed to the frames that come this many steps later. One step shows near points best, several steps show
+# far points best.
 STEPS = (1, 2, 4)
 _GRID = (16, 8)
 _CORNERS_PER_CELL = 25
@@ -36,10 +38,10 @@ _WINDOW_PX = 11
 _LARGEST_RETURN_ERROR_PX = 0.5
 _RANSAC_TOLERANCE_PX = 2.0
 _FEWEST_TRACKS = 50
-# A window that moves but does not grow errs by half a pixel on things that come nearer by a fifth: patches are aligned
-# with the zoom known, and held against weak texture in either direction.
+# A window that moves but does not grow errs by half a pixel on objects that come nearer by a fifth. Therefore patches
+# are aligned with known zoom, and limited in both directions against weak texture.
 _LIMITS = PatchLimits(radius_px=5, change_px=1.5, sigma_px=(0.06, 0.06))
-# A car that stands shows no depth by its motion.
+# A car that stands shows no depth, so the motion must be at least this long.
 _SMALLEST_MOTION_M = 0.3
 _TRACK_SIGMA_PX = 0.12
 _DEPTH_ITERATIONS = 3
@@ -50,7 +52,7 @@ Motion = tuple[NDArray[np.float64], NDArray[np.float64]]  # rotation vector (3,)
 
 
 class StereoFeatures(NamedTuple):
-    """Corners of one left image with their disparity."""
+    """These are corners of one left image with their disparity."""
 
     rig: Rig
     grey_left: NDArray[np.uint8]  # (H, W) the left image
@@ -74,7 +76,7 @@ def find_features(
 
 
 def _corners(grey: NDArray[np.uint8], usable: NDArray[np.bool_]) -> Tensor:
-    """(P, 2) whole pixels: the strongest corners of each image cell."""
+    """The strongest corners (P, 2) of each image cell, in whole pixels."""
     import cv2
 
     height, width = grey.shape
@@ -98,7 +100,7 @@ def track_features(
     features: StereoFeatures,
     later: Sequence[NDArray[np.uint8]],  # the left images (H, W) of the frames that follow, in order
 ) -> list[MotionConstraint]:
-    """Follow corners into the later images that are `STEPS` away, each time from the first, so errors do not add up."""
+    """Follow corners from the first image into the images `STEPS` later, so that errors do not add up."""
     tracked = []
     foretold: NDArray[np.float32] | None = None
     for step, grey_later in enumerate(later[: max(STEPS)], start=1):
@@ -115,7 +117,7 @@ def track_features(
 def _constraint(
     features: StereoFeatures, grey_later: NDArray[np.uint8], uv_later: Tensor, found: Tensor, motion: Motion
 ) -> MotionConstraint:
-    """The points that were found, aligned anew with the size that they have in the later image."""
+    """Constraint of the points that were found, aligned anew with their size in the later image."""
     T_later_cam = from_rotation_translation(torch.from_numpy(_rotation(motion[0])), torch.from_numpy(motion[1]))
     depth_later = transform(T_later_cam, features.points_cam)[:, 2]
     zoom = (features.points_cam[:, 2] / depth_later.clamp_min(0.5))[found]
@@ -128,7 +130,7 @@ def _constraint(
 def _follow(
     grey: NDArray[np.uint8], grey_later: NDArray[np.uint8], uv: Tensor, foretold: NDArray[np.float32] | None
 ) -> tuple[Tensor, Tensor]:
-    """Pyramidal Lucas-Kanade there and back: pixels in the later image and whether the way back ends at the start."""
+    """Follow pixels by Lucas-Kanade to the later image, and check whether the way back ends at the start."""
     import cv2
 
     if len(uv) == 0:
@@ -154,7 +156,7 @@ def _rough_motion(
     uv_later: Tensor,  # (P, 2)
     K: Tensor,
 ) -> Motion | None:
-    """What most of the points agree with."""
+    """Motion that most of the points agree with, or None if too few points do."""
     import cv2
 
     if len(points_cam) < _FEWEST_TRACKS:
@@ -180,7 +182,7 @@ def _rotation(vector: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _foretell(features: StereoFeatures, motion: Motion, factor: float) -> NDArray[np.float32]:
-    """Pixels (P, 2) of the points after `factor` times the motion; far outside of the image where they pass it."""
+    """Pixels (P, 2) of the points after `factor` times the motion; points behind the camera lie far outside."""
     rotation, translation = (torch.from_numpy(part) for part in (_rotation(motion[0] * factor), motion[1] * factor))
     later = features.points_cam @ rotation.T + translation
     uv = project(later, features.rig.K_left)
@@ -189,16 +191,16 @@ def _foretell(features: StereoFeatures, motion: Motion, factor: float) -> NDArra
 
 @dataclass(frozen=True)
 class MotionConstraint(FieldConstraint):
-    """Points of one left image found in a later one; own unknowns: a twist (6,) of `T_later_cam`.
+    """These are points of one left image found in a later one. The own unknowns are a twist (6,) of `T_later_cam`.
 
-    Depths are unknowns too, one a point; they are always the best ones for motion and field, and eliminated.
+    Every point also has an unknown depth, which is always the best one for motion and field, and eliminated.
     """
 
     uv_later: Tensor  # (P, 2) pixels in the later left image
     T_later_cam: Tensor  # (4, 4) motion of the left camera
 
     def residuals(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
-        """Disparity and later pixel, less what a change of the point's own depth could mend: that says nothing."""
+        """Residuals of disparity and later pixel without the part that a change of the point's own depth explains."""
         residual, J_depth, J_motion = self._of_depths(self.inverse_depth(coefficients), coefficients)
         J_field = torch.zeros(len(residual), 3, NUM_COEFFICIENTS, dtype=residual.dtype)
         J_field[:, 0] = polynomial_basis(self.uv, self.rig.size_wh) / PATCH_SIGMA_PX
@@ -208,7 +210,7 @@ class MotionConstraint(FieldConstraint):
         return columns[..., 0], columns[..., 1:]
 
     def inverse_depth(self, coefficients: Tensor) -> Tensor:
-        """The best ones for motion and field, by a few Newton steps from those of the disparity."""
+        """Best inverse depths (P,) for motion and field, by a few Gauss-Newton steps from those of the disparity."""
         bias = polynomial_basis(self.uv, self.rig.size_wh) @ coefficients
         inverse_depth = (1 / self.rig.depth(self.uv, self.seen[:, 2] - bias)).nan_to_num(nan=_SMALLEST_INVERSE_DEPTH)
         for _ in range(_DEPTH_ITERATIONS):
@@ -218,17 +220,20 @@ class MotionConstraint(FieldConstraint):
         return inverse_depth
 
     def moved(self, own_step: Tensor) -> Self:
-        """Another motion."""
+        """The constraint with its motion changed by a twist."""
         return replace(self, T_later_cam=exp(own_step) @ self.T_later_cam)
 
     def _of_depths(self, inverse_depth: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Disparity and later pixel, predicted minus observed, in standard deviations (P, 3); its derivatives by the
-        inverse depth (P, 3) and by the twist (P, 3, 6)."""
+        """Compute predicted minus observed disparity and later pixel (P, 3), in standard deviations, and their
+        derivatives.
+
+        The derivatives are by the inverse depth (P, 3) and by the twist (P, 3, 6).
+        """
         rays_cam, K = rays_from_pixels(self.uv, self.rig.K_left), self.rig.K_left
         disparity, slope = self.disparity(rays_cam, inverse_depth)
         bias = polynomial_basis(self.uv, self.rig.size_wh) @ coefficients
         R, t = self.T_later_cam[:3, :3], self.T_later_cam[:3, 3]
-        # The point times its inverse depth: finite however far it is.
+        # This is the point times its inverse depth, which is finite for every distance.
         later = rays_cam @ R.T + inverse_depth[:, None] * t
         uv = project(later, K)
         J_uv_later = (K[:2] - uv[..., None] * K[2]) / later[:, 2, None, None]

@@ -1,4 +1,4 @@
-"""Pixels of known depth as evidence on a rig's field: measured disparity against true, and the fit to it."""
+"""This module measures disparities at pixels of known depth and fits a rig's field to them."""
 
 from __future__ import annotations
 
@@ -14,32 +14,35 @@ from directshape_torch.rig.rig import Rig
 from directshape_torch.stereo_matching.patch_alignment import MatchedPair
 
 _GRID = (16, 8)
-# A match farther from the truth is a wrong match or a hidden point, not a bias.
+# A match farther from the truth than this is a wrong match or a hidden point, not a bias.
 _LARGEST_DIFFERENCE_PX = 4.0
 _POINTS_PER_FRAME = 30_000
-# Points of one cell share their scene and its errors: they count as this many independent ones at most, and those of
-# one frame, which share its scene and the errors of the model, as that many.
+# Points of one cell share their scene and its errors, and points of one frame also share the errors of the model.
+# Therefore the points of a cell and of a frame count as at most these numbers of independent points.
 _INDEPENDENT_PER_CELL = 10
 _INDEPENDENT_PER_FRAME = 60
 _NUM_ITERATIONS = 60
 _TUKEY = 4.685
 _SMALLEST_SCALE_PX = 0.02
-# Aligned patches are good to a tenth of a pixel or two. Wrong ones, on depth edges, err towards the nearer side by a
-# pixel and more: their spread must not become the scale by which they are judged, so it shrinks to the patches' own.
+# Aligned patches are accurate to 0.1 or 0.2 px. Wrong patches, on depth edges, err towards the nearer side by a pixel
+# and more. Their spread must not become the scale by which they are judged, so the scale shrinks to the accuracy of
+# patches.
 _FIRST_ITERATIONS = 15
 _SHRINK = 0.93
 _PATCH_SCALE_PX = 0.15
 _SMALLEST_NUMBER = 50
-_TO_SIGMA = 1.4826  # of a median absolute deviation
-# Wide enough to leave the fit to the data, and tame where those are thin; by degree.
+_TO_SIGMA = 1.4826  # sigma over the median absolute deviation
+# These prior standard deviations of each degree are wide enough to leave the fit to the data, and keep it tame where
+# there are few data.
 COEFFICIENT_SIGMA_PX = (5.0, 2.0, 1.0, 0.5, 0.5)
 _LARGEST_HULL = 24
 
 
 class PixelEvidence(NamedTuple):
-    """What pixels of known depth say of the coefficients of a field, in information form.
+    """This is what pixels of known depth say of the coefficients of a field, in information form.
 
-    Of offsets and of rows: `H c = b` at their best coefficients, `H` the inverse of their covariance.
+    The best coefficients of offsets and of rows both solve `H c = b`. The information `H` is the inverse of their
+    covariance and `b` is the vector.
     """
 
     num_points: int
@@ -48,17 +51,19 @@ class PixelEvidence(NamedTuple):
     vector: Tensor  # (10,) 1/pixels
     row_information: Tensor  # (10, 10)
     row_vector: Tensor  # (10,)
-    hull_uv: Tensor  # (M, 2) round the pixels
+    hull_uv: Tensor  # (M, 2) convex polygon around the pixels
 
     def __add__(self, other: PixelEvidence) -> PixelEvidence:  # type: ignore[override]
-        """Both together, as independent."""
+        """Add two independent pieces of evidence."""
         sums = {name: getattr(self, name) + getattr(other, name) for name in self._fields[:-1]}
         return PixelEvidence(**sums, hull_uv=hull(torch.cat([self.hull_uv, other.hull_uv])))
 
 
 def pixel_evidence(observations: Tensor, size_wh: tuple[int, int], num_frames: int = 1) -> PixelEvidence:
-    """Reweighted least squares (Tukey) on the observations (P, 4) of `observe_disparity`, each part of the image
-    counting alike; fewer than 50 raise `InputError`."""
+    """Fit the observations (P, 4) of `observe_disparity` by reweighted least squares (Tukey).
+
+    All parts of the image count equally. Fewer than 50 observations raise `InputError`.
+    """
     if len(observations) < _SMALLEST_NUMBER:
         raise InputError(
             "observations",
@@ -73,7 +78,7 @@ def pixel_evidence(observations: Tensor, size_wh: tuple[int, int], num_frames: i
 
 
 def hull(uv: Tensor) -> Tensor:  # (P, 2) -> (M, 2)
-    """Convex polygon of at most 24 corners round pixels, never beyond them."""
+    """Convex polygon of at most 24 corners around pixels; it never extends beyond their convex hull."""
     import cv2
 
     corners = cv2.convexHull(uv.numpy().astype(np.float32))
@@ -90,8 +95,11 @@ def _information(
     balance: Tensor,  # (P,)
     num_frames: int,
 ) -> tuple[Tensor, Tensor]:
-    """Tukey's biweight from a start that is the median alone; its scale shrinks from the residuals' spread to the
-    accuracy of the patches, because the outliers are one-sided."""
+    """Fit by Tukey's biweight, starting from a constant field at the median.
+
+    The scale shrinks from the spread of the residuals to the accuracy of the patches, because the outliers are
+    one-sided.
+    """
     sigma = by_degree(COEFFICIENT_SIGMA_PX)
     coefficients = torch.zeros(NUM_COEFFICIENTS, dtype=basis.dtype)
     coefficients[0] = offset_px.median()
@@ -109,12 +117,12 @@ def _information(
 
 
 def by_degree(sigma: tuple[float, ...]) -> Tensor:
-    """Standard deviations (10,) of the coefficients from those of each degree."""
+    """Standard deviations (10,) of the coefficients, each from the entry of its degree."""
     return torch.tensor([sigma[i + j] for i, j in EXPONENTS], dtype=torch.float64)
 
 
 def tukey_weight(distances: Tensor, scale: float | Tensor) -> Tensor:
-    """Tukey's biweight, (P,) in [0, 1], for residuals in standard deviations that are `scale` times too large."""
+    """Tukey's biweight (P,) in [0, 1] for residuals in standard deviations that are `scale` times too large."""
     return (1 - (distances / (_TUKEY * scale)) ** 2).clamp_min(0) ** 2
 
 
@@ -126,7 +134,7 @@ def _cell_index(uv: Tensor, size_wh: tuple[int, int]) -> Tensor:
 
 
 def _balance(uv: Tensor, size_wh: tuple[int, int]) -> Tensor:
-    """Weights that let no part of the image outvote another, as the road would, which has most of the points."""
+    """Weights (P,) that balance the parts of the image; without them the road, with most points, would dominate."""
     cell = _cell_index(uv, size_wh)
     count = torch.bincount(cell, minlength=_GRID[0] * _GRID[1]).double()
     return (_INDEPENDENT_PER_CELL / count[cell]).clamp_max(1.0)
@@ -140,8 +148,8 @@ def observe_disparity(
     """Measure the disparity at pixels of known depth: semi-global matching, then alignment of small patches.
 
     Returns:
-        (Q, 4) u, v, measured minus true disparity, measured minus true row in the right image, where both methods
-        found the point, of at most 30 000 of the pixels, evenly over the image.
+        (Q, 4) u, v, measured minus true disparity, measured minus true row in the right image, for points that both
+        methods found. At most 30 000 pixels are taken, evenly over the image.
     """
     uv, displacement = known[:, :2], rig.displacement(known[:, :2], known[:, 2])
     last = torch.tensor(rig.size_wh) - 1
@@ -151,7 +159,7 @@ def observe_disparity(
     usable = torch.nonzero((measured - displacement[:, 0]).abs() < _LARGEST_DIFFERENCE_PX)[:, 0]
     chosen = usable[_evenly(uv[usable], rig.size_wh, _POINTS_PER_FRAME)]
     uv, true = uv[chosen], displacement[chosen]
-    # The semi-global disparity leans towards whole pixels.
+    # Patches are aligned because the semi-global disparity is biased towards whole pixels.
     found = pair.aligned(uv, measured[chosen], true[:, 1])
     offset = torch.stack([found.disparity - true[:, 0], true[:, 1] - found.row_shift], dim=1)
     keep = found.reliable & (offset[:, 0].abs() < _LARGEST_DIFFERENCE_PX)
@@ -159,7 +167,7 @@ def observe_disparity(
 
 
 def _evenly(uv: Tensor, size_wh: tuple[int, int], count: int) -> Tensor:
-    """At most `count` of the pixels, thinning full cells first; in their order."""
+    """Indices of at most `count` pixels in ascending order; full cells are thinned first."""
     if len(uv) <= count:
         return torch.arange(len(uv))
     shuffled = torch.randperm(len(uv), generator=torch.Generator().manual_seed(0))

@@ -1,10 +1,10 @@
-"""The rig's unknowns given all evidence (docs/derivations/rig.md).
+"""This module solves for the rig's unknowns given all evidence (docs/derivations/rig.md).
 
     measured - implied disparity = field(u, v) + bias d + setback d^2 / (f b) + noise
 
-`d` is the measured disparity: the implied one carries the detector's error, and a regressor with the noise of what it
-explains would be bent by it. The noise is Student-t of variance `(s d)^2 + s0^2 + sigma^2`. Noises, and how far rigs of
-this kind are off at all, are summed over a grid, so that what is not known of them widens the covariance.
+`d` is the measured disparity. The implied disparity contains the detector's error, and a regressor that shares the
+noise of the offset would bias the fit. The noise is Student-t of variance `(s d)^2 + s0^2 + sigma^2`. The noises and
+the scale of the field are summed over a grid, so that uncertainty about them widens the covariance.
 """
 
 from __future__ import annotations
@@ -20,29 +20,31 @@ from directshape_torch.rig.pixels import by_degree
 
 BIAS, SETBACK = NUM_COEFFICIENTS, NUM_COEFFICIENTS + 1
 
-# Rectification leaves this much, pixels, by degree: more towards the edges than in the middle; the rows less. A rig may
-# be better than that, or exact: each of these factors is as likely.
+# Rectification leaves errors of these standard deviations in pixels for each degree. They are larger towards the edges
+# than in the middle, and smaller for rows. A rig may be better or exact, so each of the factors in `_FIELD_SCALES` is
+# equally likely.
 _FIELD_SIGMA_PX = (0.4, 0.4, 0.5, 0.3, 0.5)
 _FIELD_SCALES = torch.tensor([1.0, 0.5, 0.25, 0.05], dtype=torch.float64)
 _ROW_SIGMA_PX = (0.4, 0.3, 0.3, 0.2, 0.3)
 _ROW_NOISE_PX = 0.1
-# A detector is off in the mean by as much as it scatters, more or less.
+# The bias of a detector is about as large as its noise.
 _BIAS_OVER_NOISE = 1.5
-# Dimensions of a detector are off in the mean by as much, and those of one car.
+# These are the relative standard deviations of a detector's dimensions in the mean of all cars, and of one car.
 _DIMENSIONS_SIGMA, _SIZE_SIGMA = 0.04, 0.08
-# Surfaces lie beside the near side of their boxes by a length that the cars of one detector share.
+# Surfaces lie beside the near side of their boxes, at a distance that the cars of one detector share. This is the
+# standard deviation of the distance.
 _SETBACK_SIGMA_M = 0.15
 
 _DEGREES_OF_FREEDOM = 4
 _NUM_ITERATIONS = 30
-# Standard deviations of a detector's relative depth and of what is left where it is perfect; each with the middle
-# and the spread (of the logarithm) of what detectors have, from LiDAR to one camera.
+# The grid holds standard deviations of a detector's relative depth, and of the noise in pixels that a perfect detector
+# would leave. The prior of each is the middle and the spread of the logarithm over detectors from LiDAR to one camera.
 _DEPTH_NOISE, _DEPTH_NOISE_PRIOR = torch.logspace(-2.7, -0.7, 15, dtype=torch.float64), (0.02, 1.2)
 _CONSTANT_NOISE, _CONSTANT_NOISE_PRIOR = torch.tensor([0.15, 0.25, 0.4, 0.7], dtype=torch.float32).double(), (0.2, 0.5)
 
 
 class Posterior(NamedTuple):
-    """What is known of one rig and of the detector that looked through it."""
+    """This is what is known of one rig and of the detector that uses it."""
 
     mean: Tensor  # (12,) field coefficients (pixels), relative bias of the depth, setback (metres)
     covariance: Tensor  # (12, 12)
@@ -57,7 +59,7 @@ def solve_offsets(
     information: Tensor,  # (10, 10) of the field coefficients by other evidence
     vector: Tensor,  # (10,)
 ) -> Posterior:
-    """Mean and covariance of all unknowns; without any evidence those of the priors."""
+    """Mean and covariance of all unknowns; without any evidence the priors give them."""
     u_v, d, offset, sigma = rows[:, :2], rows[:, 2], rows[:, 3], rows[:, 4]
     A = torch.cat([polynomial_basis(u_v, size_wh), d[:, None], d[:, None] ** 2 / focal_baseline], dim=1)
     grid = torch.meshgrid(_DEPTH_NOISE, _CONSTANT_NOISE, _FIELD_SCALES, indexing="ij")
@@ -95,7 +97,7 @@ def solve_rows(
 
 
 def _bias_by_size(size_error: Tensor) -> tuple[float, float]:
-    """The detector's relative depth bias by the sizes of masks (N,), 0 where not known, and its standard deviation."""
+    """The detector's relative depth bias and its standard deviation by the size errors of masks (N,), 0 if unknown."""
     known = size_error[size_error != 0]
     if not len(known):
         return 0.0, math.inf
@@ -109,7 +111,7 @@ def _student_t(
     H_prior: Tensor,  # (G, M, M)
     b_prior: Tensor,  # (M,)
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Iteratively reweighted least squares for G noises at once: H (G, M, M), mean (G, M), log evidence (G,)."""
+    """Solve reweighted least squares for G noises at once: H (G, M, M), mean (G, M), log evidence (G,)."""
     weight = torch.ones_like(variance)
     for _ in range(_NUM_ITERATIONS):
         weighted = (weight / variance)[..., None] * A

@@ -1,4 +1,4 @@
-"""`Rig`: the images and cameras that an estimate, a field or an observation belongs to."""
+"""`Rig` describes the images and cameras that an estimate, a field or an observation belongs to."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from directshape_torch.scene import FrameBatch
 
 
 class Rig(NamedTuple):
-    """One calibrated stereo pair, float64 on the CPU; a disparity field of its camera has no part in it."""
+    """This is one calibrated stereo pair, float64 on the CPU. It does not contain a disparity field of its camera."""
 
     size_wh: tuple[int, int]  # of the images
     K_left: Tensor  # (3, 3) pixels
@@ -22,13 +22,13 @@ class Rig(NamedTuple):
 
     @classmethod
     def of(cls, camera: StereoCamera, size_wh: tuple[int, int], number: int = 0) -> Self:
-        """Of one of the frames of a camera."""
+        """The rig of one of the frames of a camera."""
         matrices = (camera.K_left, camera.K_right, camera.T_right_cam)
         return cls(size_wh, *(matrix[number].detach().to("cpu", torch.float64) for matrix in matrices))
 
     @classmethod
     def of_frame(cls, frames: FrameBatch, number: int = 0) -> Self:
-        """Of one of some frames."""
+        """The rig of the frame with the given number."""
         height, width = frames.sizes[number].tolist()
         return cls.of(frames.camera, (width, height), number)
 
@@ -37,9 +37,9 @@ class Rig(NamedTuple):
         return disparity_of_depth(uv_left, depth, *self[1:])
 
     def of_depth(self, disparity: Tensor) -> Tensor:
-        """What of disparities (P,) falls as 1 / depth: all but what principal points that differ add everywhere."""
+        """Part of disparities (P,) that falls as 1 / depth, without the constant from different principal points."""
         return disparity - (self.K_left[0, 2] - self.K_right[0, 2])
 
     def depth(self, uv_left: Tensor, disparity: Tensor) -> Tensor:
-        """Depth (P,) of left pixels (P, 2) with a true disparity (P,); NaN where no point in front has it."""
+        """Depth (P,) of left pixels (P, 2) with a true disparity (P,); NaN if no point in front has it."""
         return depth_from_disparity(uv_left, disparity, *self[1:])

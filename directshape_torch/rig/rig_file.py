@@ -1,4 +1,4 @@
-"""JSON files of rigs (docs/file_formats.md): estimates with the evidence they rest on, and fields that are given."""
+"""This module reads and writes JSON files of rig estimates and of given fields (docs/file_formats.md)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from directshape_torch.files.read_files import read_json
 from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, TENSOR_SHAPES, DisparityField
 from directshape_torch.rig.estimate import RigEstimate, to_tensor
 
-# In the folder of a run.
+# These are the names in the folder of a run.
 RIG_FILE, RIG_PICTURE = "rig.json", "rig.png"
 RIGS, FIELD, SCHEMA_VERSION = "directshape rig", "directshape disparity field", 1
 _CURE = "make it again with 'directshape calibrate-rig'"
@@ -29,7 +29,7 @@ def load_rigs(path: Path | str) -> list[RigEstimate]:
     """The estimates in a file.
 
     Raises:
-        DataFormatError: it is missing, damaged, or holds no estimates.
+        DataFormatError: the file is missing, damaged, or holds no estimates.
     """
     content = _read(path, RIGS)
     try:
@@ -39,14 +39,14 @@ def load_rigs(path: Path | str) -> list[RigEstimate]:
 
 
 def save_field(field: DisparityField, path: Path | str) -> None:
-    """Write a field by itself, for one that is given and not estimated."""
+    """Write a field alone, for example one that is given and not estimated."""
     tensors = {name: getattr(field, name).double().cpu().tolist() for name in TENSOR_SHAPES}
     known = {"size_wh": list(field.size_wh), "provenance": dict(field.provenance)}
     write_json(path, {"schema": FIELD, "schema_version": SCHEMA_VERSION, **known, **tensors})
 
 
 def load_field(path: Path | str) -> DisparityField:
-    """Read a field written by `save_field`, float64; without `covariance` it is exactly known.
+    """Read a field written by `save_field`, float64; a field without `covariance` counts as exact.
 
     Raises:
         DataFormatError: the file is missing, is not valid JSON, or does not hold what a field needs.
@@ -65,17 +65,17 @@ def load_field(path: Path | str) -> DisparityField:
 
 
 def load_fields(path: Path | str) -> tuple[DisparityField, ...]:
-    """The disparity fields of a file of rigs, or the one of a file of `save_field`; raises as `load_rigs`."""
+    """The fields in a file of `save_rigs` or of `save_field`; a bad file raises `DataFormatError`."""
     return tuple(rig.field for rig in load_rigs(path)) if holds_rigs(path) else (load_field(path),)
 
 
 def known_rigs(name: str) -> list[RigEstimate]:
-    """The estimates that `--rig` names by their file; nothing of "none", or of a field without its evidence."""
+    """Estimates in the file that `--rig` names; the list is empty for "none" and for a file of a field."""
     return load_rigs(name) if name != "none" and holds_rigs(name) else []
 
 
 def holds_rigs(path: Path | str) -> bool:
-    """Whether a JSON file is one of estimates, and not of `save_field`; raises as `load_rigs`."""
+    """Whether a JSON file holds estimates, and not one field; a bad file raises `DataFormatError`."""
     return _read(path).get("schema") == RIGS
 
 

@@ -1,4 +1,4 @@
-"""The estimates of several rigs, through which one detector looks."""
+"""This module holds the estimates of several rigs that one detector uses."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class RigEstimates(nn.ModuleList):
-    """The estimates of several rigs, for a refiner whose calls each have frames of one of them."""
+    """These are the estimates of several rigs, for a refiner. Each of its calls has frames of one rig."""
 
     def __init__(self, rigs: Sequence[RigEstimate]) -> None:
         super().__init__(rigs)
@@ -29,7 +29,7 @@ class RigEstimates(nn.ModuleList):
         return frames if rig is None else rig.corrected(frames)
 
     def informed(self, frames: FrameBatch, detections: Detections) -> Detections:
-        """The detections with what the estimate of their rig knows; those of an unknown rig stay as they are."""
+        """The detections with what the estimate of their rig knows; detections of an unknown rig stay unchanged."""
         rig = self._of(frames)
         return detections if rig is None else rig.informed(frames, detections)
 
@@ -41,7 +41,7 @@ class RigEstimates(nn.ModuleList):
 
     @property
     def results(self) -> Tensor:
-        """The results (N, 15) of all rigs, for one detector looks through all of them."""
+        """The results (N, 15) of all rigs, because one detector uses all of them."""
         nothing = torch.zeros(0, detector_noise.NUM_COLUMNS, dtype=torch.float64)
         return torch.cat([nothing, *(rig.results for rig in self if isinstance(rig, RigEstimate))])
 
@@ -56,7 +56,7 @@ class RigEstimates(nn.ModuleList):
 
 
 def rig_among(rigs: list[RigEstimate], rig: Rig) -> RigEstimate:
-    """The estimate of that rig; one that knows nothing yet joins the list where there is none."""
+    """The estimate of a rig; if there is none, one without evidence joins the list."""
     known = [estimate for estimate in rigs if estimate.is_of(*rig)] or [RigEstimate(*rig)]
     if known[0] not in rigs:
         rigs.append(known[0])

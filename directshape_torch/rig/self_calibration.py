@@ -1,8 +1,9 @@
-"""The residual disparity field of a rig from its own images alone, no LiDAR and no labels.
+"""This module finds the residual disparity field of a rig from its own images alone, without LiDAR or labels.
 
-Motion between frames sees everything but a bias proportional to disparity, which is a wrong baseline. A road at known
-height, whose pitch and roll are unknown in every frame, sees neither the field's constant nor its slope along u, but
-that along v as well as the height is known (1 cm of 1.65 m: 0.4 px between the horizon and the lower edge).
+Motion between frames shows every bias except one proportional to disparity, which is a wrong baseline. A road at known
+height has unknown pitch and roll in every frame. It shows neither the field's constant nor its slope along u. It shows
+the slope along v as precisely as the height is known: an error of 1 cm of 1.65 m gives 0.4 px between the horizon and
+the lower edge.
 """
 
 from __future__ import annotations
@@ -24,43 +25,49 @@ from directshape_torch.rig.rig import Rig
 from directshape_torch.stereo_matching.patch_alignment import MatchedPair
 from directshape_torch.stereo_matching.plane_from_points import fit_ground_plane
 
-# Standard deviation of a patch's disparity, pixels.
+# This is the standard deviation of a patch's disparity, in pixels.
 PATCH_SIGMA_PX = 0.12
-# Points of one frame share their scene, its errors and those of the model: they count as so many independent ones.
+# Points of one frame share their scene and the errors of scene and model, so they count as this many independent
+# points.
 _INDEPENDENT_POINTS = 60
 _NUM_ITERATIONS = 150
 _FIRST_ITERATIONS = 10
 _SHRINK = 0.85
 _CONVERGED_PX = 1e-4
-# A field less certain than this at its own data is that of the prior, not of the images.
+# A field less certain than this at its own data comes from the prior and not from the images.
 _LARGEST_SIGMA_PX = 0.5
 _LEAST_SIGMA_PX, _UNKNOWN_SIGMA_PX = 0.05, 0.2
-# Of the road.
+# The next constants concern the road.
 _SPACING_PX = 8
 _BORDER_PX = 6
 _DEPTH_RANGE_M = (4.0, 30.0)
 _LARGEST_LATERAL_M = 8.0
-# From the plane through the raw points, which is off itself by the rig's bias.
+# This is the largest difference to the disparity of the plane through the raw
+# points. The plane itself contains the rig's bias.
 _LARGEST_DIFFERENCE_PX = 1.5
 _FEWEST_PIXELS = 100
-# Roads are even to about this share of the camera's height, and so is the disparity on them.
+# Roads are even to about this share of the camera's height, so disparities on them are even to this share too.
 _UNEVENNESS = 0.01
-# A car bounces on its springs, and its road is no plane: this much, metres, in every frame.
+# A car moves on its springs, and its road is not a plane. This is the standard deviation of the height in a frame, in
+# metres.
 _HEIGHT_SIGMA_M = 0.02
 
 
 class Linearisation(NamedTuple):
-    """Normal equations `H delta = -g` of one constraint: its own M unknowns first, then the field's coefficients."""
+    """These are normal equations `H delta = -g` of one constraint: M own unknowns, then the coefficients."""
 
     H: Tensor  # (M + 10, M + 10)
     g: Tensor  # (M + 10,)
     spread: float  # how many times larger than expected the residuals are, by their median
 
     def of_field(self) -> tuple[Tensor, Tensor, Tensor]:
-        """H (10, 10) and g (10,) of the coefficients with the other unknowns eliminated, and these: minus their step is
-        affine in that of the coefficients, a column of constants and a matrix (M, 1 + 10)."""
+        """Eliminate the own unknowns: H (10, 10) and g (10,) of the coefficients, and a matrix (M, 1 + 10).
+
+        The step of the own unknowns is minus the first column, minus the other columns times the step of the
+        coefficients.
+        """
         H, g, M = self.H, self.g, len(self.g) - NUM_COEFFICIENTS
-        # A direction of its own unknowns that nothing sees (a bend of the road) stays where it is.
+        # A direction of the own unknowns that the points do not show (a bend of the road) stays unchanged.
         seen = H[:M, :M] + torch.diag(1e-9 * H[:M, :M].diagonal() + 1e-12)
         own = torch.linalg.solve(seen, torch.cat([g[:M, None], H[:M, M:]], dim=1))
         return H[M:, M:] - H[M:, :M] @ own[:, 1:], g[M:] - H[M:, :M] @ own[:, 0], own
@@ -68,25 +75,25 @@ class Linearisation(NamedTuple):
 
 @dataclass(frozen=True)
 class FieldConstraint(ABC):
-    """Points of one pair that the field has to explain, with M unknowns of their own."""
+    """These are points of one stereo pair that the field has to explain, with M own unknowns."""
 
     rig: Rig  # of the images
     seen: Tensor  # (P, 4) u, v, measured disparity, measured row shift v_left - v_right, pixels
 
     @abstractmethod
     def residuals(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
-        """(P, R) in standard deviations and (P, R, M + 10) by the own unknowns and the coefficients (10,)."""
+        """Residuals (P, R) in standard deviations, and derivatives (P, R, M + 10) by own unknowns and coefficients."""
 
     @abstractmethod
     def inverse_depth(self, coefficients: Tensor) -> Tensor:
-        """(P,) that belongs to the own unknowns, 1/m."""
+        """Inverse depths (P,) that belong to the own unknowns, 1/m."""
 
     @abstractmethod
     def moved(self, own_step: Tensor) -> Self:
-        """With its own unknowns changed."""
+        """The constraint with changed own unknowns."""
 
     def known(self) -> tuple[Tensor, Tensor] | None:
-        """What else is known of the own unknowns: a residual () in standard deviations, and (M,) its derivative."""
+        """Residual () in standard deviations of other knowledge about the own unknowns, and its derivative (M,)."""
         return None
 
     @property
@@ -95,7 +102,7 @@ class FieldConstraint(ABC):
         return self.seen[:, :2]
 
     def linearise(self, coefficients: Tensor, scale: float) -> Linearisation:
-        """At coefficients (10,) and the own unknowns, for residuals that are `scale` times too large."""
+        """Linearise at coefficients (10,) and the own unknowns, for residuals that are `scale` times too large."""
         residual, J = self.residuals(coefficients)
         distances = residual.norm(dim=1)
         weight = tukey_weight(distances, scale)
@@ -105,13 +112,14 @@ class FieldConstraint(ABC):
         if (known := self.known()) is not None:
             J_known = torch.cat([known[1], known[1].new_zeros(NUM_COEFFICIENTS)])
             H, g = H + torch.outer(J_known, J_known), g + J_known * known[0]
-        # Of a distance in one dimension, or in the two that a depth of its own leaves of three.
+        # This is the median distance in one dimension, or in the two dimensions that remain of three when the depth is
+        # eliminated.
         expected = 0.6745 if residual.shape[1] == 1 else math.sqrt(2 * math.log(2))
         spread = float(distances.median()) / expected if len(distances) else 1.0
         return Linearisation(H, g, spread)
 
     def observations(self, coefficients: Tensor, scale: float) -> Tensor:
-        """What `pixel_evidence` takes (Q, 4), by the depths of the own unknowns, at the points that count."""
+        """Observations (Q, 4) for `pixel_evidence` at the points that count, by the depths of the own unknowns."""
         kept = tukey_weight(self.residuals(coefficients)[0].norm(dim=1), scale) > 0
         true = self.rig.displacement(self.uv, 1 / self.inverse_depth(coefficients))
         offsets = torch.stack([self.seen[:, 2] - true[:, 0], true[:, 1] - self.seen[:, 3]], dim=1)
@@ -124,23 +132,24 @@ class FieldConstraint(ABC):
 
 
 class SelfCalibration(NamedTuple):
-    """A field from images alone."""
+    """This is a field from images alone."""
 
-    evidence: PixelEvidence  # as sure of the field at its data as the halves of the constraints agree
-    # That standard deviation: by how much the fields of the first and of the second half of the constraints are apart;
-    # what both share (height, baseline) is not in it. None where one of them determines no field: 0.2 px are taken.
+    evidence: PixelEvidence  # its certainty is how well both halves of the constraints agree
+    # This standard deviation is how far the fields of the first and of the second half of the constraints are apart. It
+    # does not contain errors that both halves share (height, baseline). It is None if one half determines no field, and
+    # the evidence then assumes 0.2 px.
     sigma_px: float | None
     converged: bool  # the last step was below 1e-4 px
 
 
 class _Solution(NamedTuple):
     coefficients: Tensor  # (10,)
-    covariance: Tensor  # (10, 10) were all constraints independent and the model true
+    covariance: Tensor  # (10, 10) if all constraints were independent and the model true
     observations: Tensor  # (P, 4)
     converged: bool
 
     def formal_sigma_px(self, size_wh: tuple[int, int]) -> float:
-        """Of the bias at the data, median; too small by several times, but large where nothing is seen."""
+        """Median sigma of the bias at the data; it is several times too small, but large if nothing is seen."""
         if len(self.observations) == 0:
             return math.inf
         basis = polynomial_basis(self.observations[:, :2], size_wh)
@@ -150,10 +159,10 @@ class _Solution(NamedTuple):
 def self_calibrate(
     constraints: Sequence[FieldConstraint], num_frames: int, on_step: Callable[[], object] = lambda: None
 ) -> SelfCalibration:
-    """The field that explains all constraints best: robust Gauss-Newton, each constraint's own unknowns eliminated.
+    """Find the field that explains all constraints best by robust Gauss-Newton that eliminates own unknowns.
 
-    The constraints are of `num_frames` frames of one rig, in their order in time. Where they do not determine the field
-    (road alone, or a car that stands) `InputError` is raised.
+    The constraints are of `num_frames` frames of one rig, in their order in time. If they do not determine the field (a
+    road alone, or a car that stands), `InputError` is raised.
     """
     cure = "give consecutive frames of a car that drives past still things (a road alone shows no constant, no slope)"
     if not constraints:
@@ -164,7 +173,7 @@ def self_calibrate(
         wanted = f"images that determine the field to {_LARGEST_SIGMA_PX} px"
         raise InputError("frames", wanted, f"{formal_px:.2g} px", cure)
     sigma_px = _sigma_from_halves(constraints, solution.observations, size_wh, on_step)
-    # What the covariance of independent points promises is several times less than what halves differ by.
+    # The covariance of independent points promises several times smaller errors than the difference of the halves.
     share = (formal_px / max(sigma_px or _UNKNOWN_SIGMA_PX, _LEAST_SIGMA_PX)) ** 2
     information = min(share, 1.0) * torch.linalg.inv(solution.covariance)
     of_pixels = pixel_evidence(solution.observations, size_wh, num_frames)
@@ -201,7 +210,7 @@ def _sigma_from_halves(
     size_wh: tuple[int, int],
     on_step: Callable[[], object],
 ) -> float | None:
-    """Half of the RMS difference between the fields of two halves: the standard deviation of the halves' mean."""
+    """Half of the RMS difference between the fields of two halves, which is the standard deviation of their mean."""
     middle = len(constraints) // 2
     first, second = (_solve(part, on_step) for part in (constraints[:middle], constraints[middle:]))
     if max(first.formal_sigma_px(size_wh), second.formal_sigma_px(size_wh)) > _LARGEST_SIGMA_PX:
@@ -212,16 +221,16 @@ def _sigma_from_halves(
 
 @dataclass(frozen=True)
 class RoadConstraint(FieldConstraint):
-    """The road of one frame, a plane at a known height; own unknowns: `inverse_plane`.
+    """This is the road of one frame, a plane at a known height. The own unknowns are `inverse_plane`.
 
-    Inverse depth is `inverse_plane . ray_cam`, hence disparity an affine function of the pixel.
+    The inverse depth is `inverse_plane . ray_cam`, so the disparity is an affine function of the pixel.
     """
 
     inverse_plane: Tensor  # (3,) `a` with `a . x_cam = 1` on the road, 1/m: minus the upward normal over the height
-    height_m: float  # of the camera above it
+    height_m: float  # of the camera above the road
 
     def residuals(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
-        """Disparity, predicted less measured."""
+        """Predicted minus measured disparity in standard deviations, and its derivatives."""
         rays_cam = rays_from_pixels(self.uv, self.rig.K_left)
         predicted, slope = self.disparity(rays_cam, self.inverse_depth(coefficients))
         basis = polynomial_basis(self.uv, self.rig.size_wh)
@@ -230,21 +239,21 @@ class RoadConstraint(FieldConstraint):
         return residual, (torch.cat([slope[:, None] * rays_cam, basis], dim=1) / sigma)[:, None]
 
     def inverse_depth(self, coefficients: Tensor) -> Tensor:
-        """That of the plane."""
+        """Inverse depths (P,) of the plane, 1/m."""
         return (rays_from_pixels(self.uv, self.rig.K_left) @ self.inverse_plane).clamp_min(1e-4)
 
     def moved(self, own_step: Tensor) -> Self:
-        """Another plane."""
+        """The constraint with its plane changed by a step."""
         return replace(self, inverse_plane=self.inverse_plane + own_step)
 
     def known(self) -> tuple[Tensor, Tensor]:
-        """The height."""
+        """Residual () of the camera's height in standard deviations, and its derivative (3,)."""
         height = 1 / self.inverse_plane.norm()
         return (height - self.height_m) / _HEIGHT_SIGMA_M, -self.inverse_plane * height**3 / _HEIGHT_SIGMA_M
 
 
 def find_road(pair: MatchedPair, rig: Rig, height_m: float) -> RoadConstraint | None:
-    """Pixels 4 to 30 m ahead that lie near the dominant plane; None where no road is seen."""
+    """Constraint of the pixels 4 to 30 m ahead that lie near the dominant plane; None if no road is seen."""
     seen = pair.seen_at(_grid(pair.matched))
     rays_cam = rays_from_pixels(seen[:, :2], rig.K_left)
     plane = fit_ground_plane(rig.depth(seen[:, :2], seen[:, 2])[:, None] * rays_cam)
@@ -261,7 +270,7 @@ def find_road(pair: MatchedPair, rig: Rig, height_m: float) -> RoadConstraint | 
 
 
 def _grid(matched: Tensor) -> Tensor:
-    """(P, 2) every eighth pixel of the lower half that has a disparity."""
+    """Every eighth pixel (P, 2) of the lower half that has a disparity."""
     height, width = matched.shape
     v = torch.arange(height // 2, height - _BORDER_PX, _SPACING_PX)
     u = torch.arange(_BORDER_PX, width - _BORDER_PX, _SPACING_PX)
