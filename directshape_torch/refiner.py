@@ -1,4 +1,4 @@
-"""`DirectShapeRefiner`: from frames and rough boxes to refined poses and shapes, in one batched Gauss-Newton."""
+"""`DirectShapeRefiner` refines poses and shapes from frames and rough boxes in one batched Gauss-Newton."""
 
 from __future__ import annotations
 
@@ -33,32 +33,34 @@ from directshape_torch.state.cars import CarBatch, CarState
 
 
 class KnownRig(Protocol):
-    """What is known of the rig that frames come from, `rig.estimate.RigEstimate`."""
+    """This is what is known of the rig that frames come from, such as a `rig.estimate.RigEstimate`."""
 
     def corrected(self, frames: FrameBatch) -> FrameBatch:
         """Frames whose camera has the rig's disparity field."""
         ...
 
     def informed(self, frames: FrameBatch, detections: Detections) -> Detections:
-        """Detections with what is not known of their depths and of the rig, where they do not say it."""
+        """Detections with standard deviations of depths and of the rig's offset, where they bring none."""
         ...
 
     def detector_sigmas(self) -> Tensor | None:
-        """Standard deviations (7,) of the detector, see `refinement.fusion.fused`; None where nothing is known."""
+        """Standard deviations (7,) of the detector, see `refinement.fusion.fused`; None if nothing is known."""
         ...
 
 
 class DirectShapeRefiner(nn.Module):
-    """Refines pose and shape of cars in stereo frames (paper: DirectShape).
+    """This `nn.Module` refines pose and shape of cars in stereo frames (paper: DirectShape).
 
     Args:
-        prior: family of shapes in any encoding; default the bundled grids of parametric cars. It is a submodule: its
-            tensors move with `.to(...)` and live in the `state_dict`.
-        config: settings; default `RefinerConfig()`, the same as `configs/default.yaml`.
-        extra_terms: make terms of one's own for the cars of a call (docs/extra_terms.md), beside those of the method.
-        rig: corrects frames that bring no disparity field of their own, and says how good the detector's depths and
-            its own field are where nobody else does: a `RigEstimate`, which lives in the `state_dict` too. Without one
-            cameras may be off by `config.rig.disparity_sigma_px`, and detectors are taken to be as most are.
+        prior: family of shapes in any encoding. Default: the bundled grids of parametric cars. The prior is a
+            submodule, so its tensors move with `.to(...)` and live in the `state_dict`.
+        config: settings. Default: `RefinerConfig()`, which equals `configs/default.yaml`.
+        extra_terms: factories of a user's own terms for the cars of a call (docs/extra_terms.md), in addition to the
+            terms of the method.
+        rig: a `RigEstimate`, which lives in the `state_dict` too. It corrects frames that bring no disparity field of
+            their own, and says how good the detector's depths and its own field are if frames and detections do not say
+            it. Without a rig, cameras may be off by `config.rig.disparity_sigma_px`, and the detector is taken to be as
+            good as most detectors.
 
     Raises:
         InputError: a prior without the members or derivatives that `ShapePrior` lists; settings that are no
@@ -100,20 +102,20 @@ class DirectShapeRefiner(nn.Module):
     ) -> RefinementResult:
         """Refine every car of one or several frames.
 
-        With `config.backward.mode` other than "none" pose and code of the result carry gradients to the masks, the
-        images, the prior's tensors, the term weights, the disparity that the frames bring and the detector's standard
-        deviations; to the input poses with "unroll", and in the other modes where there are such standard deviations,
-        or where results are brought together with the detector's boxes (`weighs_detector`).
+        If `config.backward.mode` is not "none", pose and code of the result carry gradients to the masks, the images,
+        the prior's tensors, the term weights, the disparity that the frames bring and the detector's standard
+        deviations. They carry gradients to the input poses with "unroll". In the other modes they do so only if the
+        detector has standard deviations or if results are combined with the detector's boxes (`weighs_detector`).
 
         Args:
             frames: F frames; dtype and device must be those of the prior.
             detections: B cars in any order; their dtype follows that of the frames.
-            term_weights: (B,) factors of named terms for each car, beside the weights of the configuration: how far a
-                network trusts each of them.
+            term_weights: factors (B,) of named terms for each car, for example how far a network trusts a term. They
+                multiply the weights of the configuration.
 
         Returns:
             Poses, shapes, statuses, costs and covariances, in the order of the detections. Cars that cannot be refined
-            keep their input pose and say why; they touch no other car.
+            keep their input pose, and their status says why. They do not affect other cars.
 
         Raises:
             InputError: frames, detections and prior do not fit together; a term that does not exist; gradients are
@@ -122,7 +124,8 @@ class DirectShapeRefiner(nn.Module):
             CompilationError: `compile: on` where something must be compiled and cannot be.
         """
         if torch.compiler.is_compiling():
-            # One break in the graph of a compiled model around it: the loop decides by values all the time.
+            # A compiled model around the refiner gets one graph break here, because the iterations decide by values all
+            # the time.
             return torch.compiler.disable(self._checked_refine)(frames, detections, term_weights)  # type: ignore[no-any-return, no-untyped-call]
         return self._checked_refine(frames, detections, term_weights)
 
@@ -130,7 +133,7 @@ class DirectShapeRefiner(nn.Module):
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None
     ) -> RefinementResult:
         detections = in_dtype_of(frames, detections)
-        # Standard deviations that are given are a prior of the energy, beside which the box must not count again.
+        # Given standard deviations are a prior of the energy. The detector's box must not count a second time.
         sigmas = self.detector_sigmas if detections.pose_sigma is None else None
         frames, detections = self._with_rig(frames, detections)
         noise = None if sigmas is None else noise_of_boxes(sigmas, detections.T_cam_obj)
@@ -149,19 +152,19 @@ class DirectShapeRefiner(nn.Module):
 
     @property
     def weighs_detector(self) -> bool:
-        """Whether results are brought together with the detector's boxes.
+        """Whether results are combined with the detector's boxes.
 
-        What the images are off by was measured with the method "direct", and standard deviations that the settings give
-        are a prior of the energy.
+        The errors of the images were measured with the method "direct" only. Standard deviations in the settings are a
+        prior of the energy, so the box must not count a second time.
         """
         priors = self.config.priors
         return self.config.method == "direct" and priors.detector_weight > 0 and not any(priors.pose_sigmas)
 
     @property
     def detector_sigmas(self) -> Tensor | None:
-        """Standard deviations (7,) by which the detector's boxes count, see `RigEstimate.detector_sigmas`, or None.
+        """Standard deviations (7,) that weigh the detector's boxes, see `RigEstimate.detector_sigmas`, or None.
 
-        Of a detector of which nothing has been learnt they are those of most detectors.
+        If nothing has been learnt of the detector, they are typical values of detectors.
         """
         if not self.weighs_detector:
             return None
@@ -169,18 +172,18 @@ class DirectShapeRefiner(nn.Module):
         return (UNKNOWN_DETECTOR if learnt is None else learnt) / math.sqrt(self.config.priors.detector_weight)
 
     def _is_rig_unknown(self, frames: FrameBatch) -> bool:
-        """Whether neither a field, a rig's or the frames' own, nor the settings say what the cameras are off by."""
+        """Whether the camera error is unknown: frames have no disparity field and its sigma is not set to 0."""
         is_known = frames.camera.disparity_field is not None or self.config.rig.disparity_sigma_px == 0
-        # The other methods' points and boxes know no offset.
+        # Points and boxes of the other methods have no unknown offset.
         return not is_known and self.config.method == "direct"
 
     def _warn_of(self, frames: FrameBatch, detections: Detections) -> None:
-        """Mistakes that the tensors of this call show, as the setting `check` asks."""
+        """Warn of mistakes that the tensors of this call show, as the setting `check` asks."""
         when = self.config.check
         is_due = when == "always" or (when == "first" and not self._has_checked)
         if not is_due or not len(detections) or is_within_transform():
             return
-        # Here, for it is needed once in a process that asks for it.
+        # The import stands here, because only a process that asks for the check needs it, mostly once.
         from directshape_torch.scene_check.check_scene import check_scene
 
         self._has_checked = True
@@ -189,7 +192,7 @@ class DirectShapeRefiner(nn.Module):
                 warnings.warn(str(finding), SceneWarning, stacklevel=6)
 
     def _warn_without_gradient(self, frames: FrameBatch, detections: Detections) -> None:
-        """Once: a loss behind the result would train nothing before it, without a word."""
+        """Warn once that a loss on the result would silently train nothing before the refiner."""
         if self._has_warned or self.config.backward.mode != "none" or not torch.is_grad_enabled():
             return
         inputs = (*frames.tensors("frames"), *detections.tensors("detections"))
@@ -227,7 +230,7 @@ class DirectShapeRefiner(nn.Module):
     def problem(
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None = None
     ) -> tuple[CarProblem, CarState]:
-        """The minimisation problem and the input state of these cars, for experiments; statuses are not checked."""
+        """The minimisation problem and the input state of the cars, for experiments; cars are not refused."""
         frames, detections = self._with_rig(frames, in_dtype_of(frames, detections))
         cars = self._cars(frames, detections)
         seen = self._observe(frames, detections)
@@ -237,16 +240,16 @@ class DirectShapeRefiner(nn.Module):
         return problem, self._input_state(detections.T_cam_obj, cars)
 
     def _with_rig(self, frames: FrameBatch, detections: Detections) -> tuple[FrameBatch, Detections]:
-        """The call's inputs, checked, with what is known of the rig and the detector."""
+        """Check the inputs of a call and add what is known of the rig and the detector."""
         frames = frames if self.rig is None else self.rig.corrected(frames)
         check_fit(frames, detections, self.prior)
         if self.rig is None:
             return frames, detections
         informed = self.rig.informed(frames, detections)
-        # What the settings say wins.
+        # Standard deviations of the settings take precedence over those of the rig.
         if any(self.config.priors.pose_sigmas):
             informed = replace(informed, pose_sigma=detections.pose_sigma)
-        # The other methods' points and boxes know no offset.
+        # Points and boxes of the other methods have no unknown offset.
         if self.config.method != "direct":
             informed = replace(informed, offset_sigma_px=detections.offset_sigma_px)
         return frames, informed
@@ -260,7 +263,7 @@ class DirectShapeRefiner(nn.Module):
         return CarState.of(se3.inverse(T_cam_obj), code, cars.num_offsets)
 
     def _observe(self, frames: FrameBatch, detections: Detections) -> Observation:
-        """What the images show of all cars; stereo points for the methods that use them."""
+        """What the images show of all cars, with stereo points for the methods that use them."""
         seen = pack_pixels(frames, detections, self.config.sampling)
         if self.config.method in ("direct", "box_alignment"):
             return seen
@@ -279,14 +282,14 @@ class DirectShapeRefiner(nn.Module):
             return align_boxes(problem, initial, cars, came)
         if cars.track_id is None:
             return Refined.of(problem, cars, initial, initial, came).result(initial)
-        # Here, for cars by themselves need nothing of it.
+        # The import stands here, because only cars in tracks need it.
         from directshape_torch.tracks.share import brought_together
 
         return brought_together(problem, cars, initial, came)
 
 
 def _config_cure(config: object) -> str:
-    """How to come to settings from what was given instead of them."""
+    """Advice how to get settings from what was given in place of them."""
     if isinstance(config, (str, PurePath)):
         return f'pass config=load_config("{config}")'
     return 'pass config=load_config("fast"), or config_from_mapping(RefinerConfig, ...) of nested keys'
