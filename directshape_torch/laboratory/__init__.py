@@ -1,1 +1,1 @@
-"""The Jacobian laboratory: every derivative of the energy three ways, in named regimes, with counted exclusions."""
+"""This package compares every derivative of the energy three ways, in named regimes, with counted exclusions."""

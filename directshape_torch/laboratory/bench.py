@@ -1,4 +1,4 @@
-"""The states of a regime with everything that is examined at them: pixels, all terms, where rows look."""
+"""This module prepares the states of a regime with everything that is examined at them: pixels, terms and rows."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ TERM_NAMES = (
     "shape", "height", "tilt_normal", "tilt_cosine", "dimensions", "pose",
 )  # fmt: skip
 TRACK_NAMES = (*MOTION_NAMES, NEXT_VIEW_NAME)
-"""Of views of a track, in whose regime alone they are."""
+"""These terms of views of a track exist only in the regime of a track."""
 
-# Each look begins where the last one ended: tracked depths converge to the last digit.
+# Each look begins where the previous one ended, so that tracked depths converge to the last digit.
 _LOOKS = 3
 _CELLS_TO_CHOOSE_FROM = 3000
 _CONTOUR = 3.0
@@ -49,14 +49,14 @@ _POINT_NOISE_M = 0.05
 
 @dataclass(frozen=True)
 class Bench:
-    """B states of one regime, ready to be examined."""
+    """These are B states of one regime, ready to be examined."""
 
-    regime: Regime  # that they were drawn from
-    stage: CarStage  # of the problem with the default settings, a pose prior, points and the user's own terms, begun
-    terms: Mapping[str, Term]  # by the laboratory's names, in all forms, the paper's among them
+    regime: Regime  # the regime of the states
+    stage: CarStage  # begun, with default settings, a pose prior, points and the user's own terms
+    terms: Mapping[str, Term]  # by the laboratory's names, in all forms including the paper's
     state: CarState | TrackState  # of the B cars
-    sight: Sight  # what the rays see of it
-    rows: Mapping[str, Linear]  # residuals and factors of each term at that state
+    sight: Sight  # what the rays see of the state
+    rows: Mapping[str, Linear]  # residuals and factors of each term at the state
 
     @property
     def problem(self) -> CarProblem:
@@ -68,12 +68,12 @@ class Bench:
 
     @property
     def rays_per_car(self) -> Tensor:
-        """Rays (B,) of both images."""
+        """Number of rays (B,) of each car in both images."""
         masks, count = self.problem.masks, torch.zeros_like(self.state.code[:, 0])
         return count.index_add(0, masks.rays.owner, masks.filled.sum(dim=1))
 
     def moved(self, delta: Tensor) -> CarState | TrackState:
-        """All cars moved by one tangent vector (D,)."""
+        """The state with all cars moved by one tangent vector (D,)."""
         return self.state.unknowns.retract(self.state, delta.expand(len(self.state.code), self.num_unknowns))
 
     @classmethod
@@ -102,7 +102,7 @@ class Bench:
             silhouette=replace(config.silhouette, form="product"),
             priors=replace(config.priors, tilt_form="cosine"),
         )
-        # Pixel sets are fixed where a refinement would begin, so that rows get lost on the way to the state.
+        # Pixel sets are fixed where a refinement would begin, so that some rows are lost between there and the state.
         no_offset = torch.zeros_like(drawn.state.offset_px)
         start = drawn.state._replace(T_obj_cam=se3.inverse(detections.T_cam_obj), offset_px=no_offset)
         stages = []
@@ -110,7 +110,7 @@ class Bench:
             problem = problem_of_scene(c, prior, frame, detections, cars, seen, own_terms)
             if isinstance(drawn.state, TrackState):
                 problem = _of_a_track(problem, cars, drawn.state.alone)
-            # A track has the last stage alone.
+            # A track has only the last stage.
             number = min(regime.stage, len(problem.stages()) - 1)
             stages.append(problem.begin(number, problem.look(start)))
         if own_terms:
@@ -123,7 +123,7 @@ class Bench:
 
 @torch.no_grad()
 def rows_at(term: Term, sight: Sight) -> Linear:
-    """The rows of a term at a state, its depths as precise as the dtype allows."""
+    """The rows of a term at a state, with depths as precise as the dtype allows."""
     at = linear_of(term, sight.field, sight.state, term.where(sight))
     for _ in range(_LOOKS):
         at = linear_of(term, sight.field, sight.state, at.where)
@@ -131,9 +131,9 @@ def rows_at(term: Term, sight: Sight) -> Linear:
 
 
 def _settings(regime: Regime, pixels_per_car: int) -> RefinerConfig:
-    """The default ones with every prior and few pixels."""
+    """The default settings with every prior and few pixels."""
     config = RefinerConfig(method="combined")
-    # A stereo detector's standard deviations: without any that prior would not be there to be examined.
+    # These are a stereo detector's standard deviations. Without them there would be no pose prior to examine.
     priors = replace(
         config.priors,
         pose_sigma_along_share=0.02,
@@ -142,7 +142,7 @@ def _settings(regime: Regime, pixels_per_car: int) -> RefinerConfig:
         pose_sigma_yaw_deg=4.0,
     )
     cells = pixels_per_car if regime.pixels == "sampled" else _CELLS_TO_CHOOSE_FROM
-    # Gradients of the image choose the pixels on both sides: there the residuals are not flat.
+    # Image gradients choose the pixels on both sides, because residuals have a slope there.
     sampling = replace(
         config.sampling, mode_right="adaptive", min_pixels=cells, max_pixels=cells, occlusion=regime.occlusion
     )
@@ -159,7 +159,7 @@ def _check_refused(
     seen: Observation,
     own_terms: Sequence[TermFactory],
 ) -> None:
-    """Raise `InputError` unless a user's terms say of cars, made without the first one, what they say beside it."""
+    """Raise `InputError` unless a user's terms give equal values for cars with and without the first car."""
     keep = torch.arange(len(cars)) > 0
     all_cars, few = (
         problem_of_scene(config, prior, scene.frame, detections, cars.of_cars(kept), seen.of_objects(kept), own_terms)
@@ -179,7 +179,7 @@ def _check_refused(
 
 
 def _of_a_track(problem: CarProblem, cars: CarBatch, state: CarState) -> CarProblem:
-    """The problem of cars that are views of one track, a tenth of a second apart, from a camera that drives a curve."""
+    """The problem of cars as views of one track, 0.1 s apart, from a camera that drives a curve."""
     number = torch.arange(len(cars))
     time_s = 0.1 * number.to(state.code)
     T_world_cam = se3.exp(time_s[:, None] * time_s.new_tensor([0.5, 0.0, 10.0, 0.0, 0.2, 0.0]))
@@ -189,7 +189,7 @@ def _of_a_track(problem: CarProblem, cars: CarBatch, state: CarState) -> CarProb
 
 
 def _named(stage: CarStage, other_forms: CarStage) -> dict[str, Term]:
-    """The terms of a stage and the other forms of two of them; those of a user under their own names."""
+    """The terms of a stage by name, with the other forms of two of them; a user's terms keep their names."""
     plain, other = (
         {"silhouettes" if len(t.names) > 1 else t.names[0]: t for t in s.terms} for s in (stage, other_forms)
     )
@@ -199,7 +199,7 @@ def _named(stage: CarStage, other_forms: CarStage) -> dict[str, Term]:
 
 
 def _points(pixels: PixelSamples, state: State, generator: torch.Generator) -> PointSamples:
-    """A point beside the middle of its car, on the ray of each left pixel."""
+    """Points near the middle of their cars, one on the ray of each left pixel."""
     car = pixels.object_index
     depth = se3.inverse(state.T_obj_cam)[car, 2, 3]
     noise = torch.randn(len(car), 3, generator=generator, dtype=torch.float64)
@@ -217,7 +217,7 @@ def _chosen(
     pixels_per_car: int,
     generator: torch.Generator,
 ) -> Observation:
-    """The pixels that a regime is about, at most so many per car and side."""
+    """The pixels that a regime is about, at most `pixels_per_car` for each car and side."""
     field, bounds = field_of(prior.bind(state.code)), prior.bounds_obj
     zeta = contour_zeta(cars, config.stages[regime.stage])
     chosen = []
@@ -243,13 +243,13 @@ def _chosen(
 
 
 def near_border(prior: PCAShapePrior, points_obj: Tensor) -> Tensor:
-    """Which points (3, ...) lie within a cell of the border of a prior's grid."""
+    """Whether points (3, ...) lie within a cell of the border of a prior's grid."""
     lower, upper = (corner.view(3, *[1] * (points_obj.ndim - 1)) for corner in prior.bounds_obj)
     return torch.minimum(points_obj - lower, upper - points_obj).amin(dim=0) < prior.spacing_m
 
 
 def _at_most(pixels: PixelSamples, wanted: Tensor, count: int, generator: torch.Generator) -> PixelSamples:
-    """Some of the wanted pixels of each car, drawn at random, in their order."""
+    """At most `count` wanted pixels of each car, drawn at random, in their original order."""
     keep = torch.zeros_like(wanted)
     for car in set(pixels.object_index.tolist()):
         rows = (wanted & (pixels.object_index == car)).nonzero()[:, 0]

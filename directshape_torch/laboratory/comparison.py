@@ -1,4 +1,4 @@
-"""Three Jacobians against one another: relative errors of entries, exclusions and their reasons, bounds."""
+"""This module compares three Jacobians: relative errors of entries, exclusions with reasons, and bounds."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from directshape_torch.laboratory.differences import KINK, DifferenceSweep, choo
 from directshape_torch.laboratory.experiments import Experiment, Subject
 
 BOUNDS: Mapping[str, float] = {"analytic-autograd": 1e-9, "analytic-numeric": 1e-6}
-"""Largest permitted error of an entry in float64, relative to the norm of its row."""
+"""These are the largest permitted errors of an entry in float64, relative to the norm of its row."""
 MAX_EXCLUDED_SHARE_TYPICAL = 0.02
 MAX_VALUE_ERROR = 1e-9
-"""Of the two ways in which a term computes its residuals, relative."""
+"""This bounds the relative difference between the two ways in which a term computes its residuals."""
 
-# Differences must reach a quarter of the bound that they are to decide.
+# Differences must have an error of at most this share of the bound that they decide.
 _RESOLUTION_SHARE = 0.25
-# A derivative's estimated error, as a share of the derivative, that only a kink explains.
+# Only a kink explains a larger estimated error of a derivative than this share of the derivative.
 _KINK_SHARE = 0.1
-# A row is compared relative to its norm, but rows shorter than a millionth of the longest of their regime (a ray deep
-# inside the mask, a neighbour on a white wall) relative to that millionth: rounding of their parts is all they are.
+# A row is compared relative to its norm. Rows shorter than a millionth of the longest row of their regime (a ray deep
+# inside the mask, a neighbour on a white wall) contain only rounding, so they are compared relative to that millionth.
 _FLAT_SHARE = 1e-6
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """One subject in one regime."""
+    """This is the comparison of one subject in one regime."""
 
-    name: str  # of the term, or of its gradient
+    name: str  # of the term or of its gradient
     regime: str  # of the state
     entries: int  # rows times unknowns
     compared: int  # entries that differences could judge
-    excluded: Mapping[str, int]  # by reason, the entries that they could not
+    excluded: Mapping[str, int]  # by reason, entries that differences could not judge
     zero_rows: int  # rows whose Jacobian is exactly zero, also by a skip rule of the residual
     errors: Mapping[str, float]  # the largest of each pair of `BOUNDS`, relative
-    value_error: float = 0.0  # see `Subject`
+    value_error: float = 0.0  # see `Subject.value_error`
 
     @property
     def excluded_share(self) -> float:
@@ -64,19 +64,19 @@ class Comparison:
 
 
 def compare(experiment: Experiment, regime: str) -> list[Comparison]:
-    """Difference the subjects of an experiment and compare their three Jacobians, float64."""
+    """Differentiate the subjects of an experiment numerically and compare their three Jacobians, float64."""
     found = sweep(experiment.evaluate, experiment.units)
     return [_compare(s, f, regime) for s, f in zip(experiment.subjects, found, strict=True)]
 
 
 def _compare(subject: Subject, found: DifferenceSweep, regime: str) -> Comparison:
     norm = subject.norm
-    moving = norm != 0  # NaN among them: its errors are NaN and break the bounds
+    moving = norm != 0  # includes NaN, whose errors are NaN and break the bounds
     finite = norm[moving & norm.isfinite()]
     longest = finite.max() if len(finite) else norm.new_ones(())
     scale = norm.clamp_min(float(_FLAT_SHARE * longest))
     choice = choose(found, _RESOLUTION_SHARE * BOUNDS["analytic-numeric"] * scale)
-    # Everything that has no reason to be excluded is judged: a difference that is no number breaks its bound.
+    # Every entry without a reason for exclusion is judged, so a difference that is NaN breaks its bound.
     judged = moving[:, None] & ~torch.stack(list(choice.excluded.values())).any(dim=0)
     excluded = {reason: int((e & moving[:, None]).sum()) for reason, e in choice.excluded.items()}
     constant_errors, kinks = _rows_that_should_be_constant(found, ~moving)
@@ -100,13 +100,13 @@ def _compare(subject: Subject, found: DifferenceSweep, regime: str) -> Compariso
 
 
 def _rows_that_should_be_constant(found: DifferenceSweep, constant: Tensor) -> tuple[Tensor, int]:
-    """Rows whose Jacobians are zero have no norm to compare with: their differences must be rounding alone.
+    """Check that the differences of rows with zero Jacobians, which have no norm to compare with, are only rounding.
 
-    Judged at the smallest stencil, where a kink is least likely; an entry beyond four times its rounding is an
-    infinite relative error.
+    They are judged at the smallest stencil, where a kink is least likely. An entry beyond four times its rounding
+    counts as an infinite relative error.
 
     Returns:
-        The errors of the entries without a kink there, and the number of the others.
+        The errors of the entries without a kink in the smallest stencil, and the number of entries with one.
     """
     derivative, error, rounding = (x[-1][constant] for x in (found.extrapolated, found.error, found.rounding))
     still = derivative.abs() <= 4 * rounding
@@ -115,5 +115,5 @@ def _rows_that_should_be_constant(found: DifferenceSweep, constant: Tensor) -> t
 
 
 def _largest(errors: Tensor) -> float:
-    """NaN where one is; zero of none."""
+    """The largest error; NaN if any is NaN, and zero if there are none."""
     return float(errors.max()) if errors.numel() else 0.0

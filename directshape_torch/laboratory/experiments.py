@@ -1,6 +1,6 @@
-"""What the laboratory examines: terms and their gradients, ready to be differenced.
+"""This module prepares terms and their gradients for numerical differentiation in the laboratory.
 
-A subject has a hand-derived and an autograd Jacobian, at the very values that its rows take at the states of a regime.
+A subject has a hand-derived and an autograd Jacobian, both at the values of its rows at the states of a regime.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from directshape_torch.laboratory.differences import Evaluate
 from directshape_torch.shape.field import field_of
 from directshape_torch.terms.term import Linear, Term, by_autograd, linear_of
 
-# The samples of the paper's product lie between the bounds of the grid and move with them; they are constants of a
-# linearisation by definition, and its Jacobian is that of the residual at fixed samples.
+# The samples of the paper's product lie between the bounds of the grid and move with the bounds. By definition they are
+# constants of a linearisation, so its Jacobian is the Jacobian of the residual at fixed samples.
 AT_FIXED_DEPTHS = ("silhouettes_product",)
 
 
 @dataclass(frozen=True)
 class Subject:
-    """R values of D unknowns."""
+    """This subject has R values that depend on D unknowns."""
 
     name: str  # of the term
     analytic: Tensor  # (R, D) hand-derived
     autograd: Tensor  # (R, D)
-    # So many consecutive rows are the components of one gradient and are compared relative to their common norm.
+    # This many consecutive rows are the components of one gradient and are compared relative to their common norm.
     block: int = 1
     value_error: float = 0.0  # largest difference of the values that two ways of computing them give, relative
 
     @property
     def norm(self) -> Tensor:
-        """Norm (R,) of each row, or of the vector that it belongs to."""
+        """Norm (R,) of each row, or of the vector that the row belongs to."""
         own = torch.maximum(self.analytic.norm(dim=1), self.autograd.norm(dim=1))
         of_vector: Tensor = own.reshape(-1, self.block).norm(dim=1)
         return of_vector.repeat_interleave(self.block)
@@ -42,18 +42,19 @@ class Subject:
 
 @dataclass(frozen=True)
 class Experiment:
-    """Subjects that are evaluated together at each displacement of their common unknowns."""
+    """These subjects are evaluated together at each displacement of their common unknowns."""
 
-    subjects: tuple[Subject, ...]  # J of them
-    evaluate: Evaluate  # their values at a displacement (D,), in the order of the subjects
+    subjects: tuple[Subject, ...]  # J subjects
+    evaluate: Evaluate  # values of the subjects, in their order, at a displacement (D,)
     units: Tensor  # (D,) see `sweep`
 
 
 def term_experiment(bench: Bench, names: Sequence[str]) -> Experiment:
-    """The named terms of a bench by twist and code, each residual of a row that counts.
+    """The experiment on every counted residual of the named terms of a bench, by twist and code.
 
-    Hand-derived is `Term.linear` and autograd differentiates `Term.residual`, both at the same points; differences
-    are those of the residuals that `Term.linear` gives at displaced states, where it looks anew, as the solver does.
+    `Term.linear` gives the hand-derived Jacobian, and autograd differentiates `Term.residual` at equal points.
+    Differences use the residuals that `Term.linear` gives at displaced states, where it looks anew, as it does for the
+    solver.
     """
     terms = [bench.terms[name] for name in names]
     rows = [bench.rows[name] for name in names]
@@ -78,10 +79,10 @@ def term_experiment(bench: Bench, names: Sequence[str]) -> Experiment:
 
 
 def gradient_experiment(bench: Bench, names: Sequence[str]) -> Experiment:
-    """The gradients `w rho'(r) J` (D,) of each row of the named terms, by twist and code: second derivatives.
+    """The experiment on the gradients `w rho'(r) J` (D,) of each row of the named terms, by twist and code.
 
-    `Term.linear` is differentiated as gradients through a refinement differentiate it. There is no hand-derived form:
-    both Jacobians of a subject are those of autograd.
+    The derivatives of gradients are second derivatives. `Term.linear` is differentiated as gradients through a
+    refinement differentiate it. There is no hand-derived form, so both Jacobians of a subject come from autograd.
     """
     terms = [bench.terms[name] for name in names]
     rows = [bench.rows[name] for name in names]
@@ -106,7 +107,7 @@ def jacobian(at: Linear) -> Tensor:
 
 
 def row_gradients(term: Term, at: Linear) -> Tensor:
-    """What each row (M, R, D) adds to the gradient of its car, not yet weighted by its block."""
+    """Part (M, R, D) that each row adds to the gradient of its car, before the weight of its block."""
     inner = (term.row_weight * term.norm(at.residual).gradient_weight * at.J_residual_inner).sum(dim=-1)
     return inner[..., None] * at.J_inner_state
 

@@ -1,4 +1,4 @@
-"""Named regimes: which states the laboratory draws, and which of their pixels it looks at."""
+"""This module defines named regimes: which states the laboratory draws, and which pixels it examines."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ _GROUND_Y_M = 1.65
 
 
 class DrawnStates(NamedTuple):
-    """B states with the detections whose pixels they are judged by."""
+    """These are B states with the detections whose pixels are examined."""
 
     detections: Detections
     state: CarState | TrackState
 
 
 class Draw(NamedTuple):
-    """What states are drawn from, and the ways to draw them."""
+    """This holds what states are drawn from, and the ways to draw them."""
 
     scene: LaboratoryScene
     prior: PCAShapePrior
@@ -42,15 +42,15 @@ class Draw(NamedTuple):
     generator: torch.Generator
 
     def uniform(self, low: float, high: float) -> Tensor:
-        """One number a state."""
+        """One random number for each state."""
         return low + (high - low) * torch.rand(self.num_states, generator=self.generator, dtype=torch.float64)
 
     def yaw(self) -> Tensor:
-        """Any heading."""
+        """One random heading for each state."""
         return self.uniform(-math.pi, math.pi)
 
     def disturbed(self, state: CarState, metres: float, degrees: float, sigma: float) -> CarState:
-        """States moved and turned at random, codes with normal deviates added."""
+        """States moved and turned at random, with normal deviates added to their codes."""
         count, num_codes = state.code.shape
         delta = torch.randn(count, 6, generator=self.generator, dtype=torch.float64)
         delta = delta * torch.tensor([metres] * 3 + [math.radians(degrees)] * 3, dtype=torch.float64)
@@ -58,7 +58,7 @@ class Draw(NamedTuple):
         return state.unknowns.retract(state, torch.cat([delta, change], dim=1), max_code=3.0)
 
     def of_frame(self, T_cam_obj: Tensor, code: Tensor, metres: float, degrees: float, sigma: float) -> DrawnStates:
-        """The detections of the frame, over and over, at states about the given ones of each."""
+        """Repeated detections of the frame, at random states near the given poses and codes."""
         rows = torch.arange(self.num_states) % len(T_cam_obj)
         start = CarState.of(se3.inverse(T_cam_obj[rows]), code[rows])
         detections = select_detections(self.scene.detections, rows)
@@ -67,7 +67,7 @@ class Draw(NamedTuple):
     def placed(
         self, x_m: Tensor, z_m: Tensor, yaw_rad: Tensor, code: Tensor | None = None, disturb: bool = True
     ) -> DrawnStates:
-        """Cars put somewhere, seen from states a little off."""
+        """Cars placed as given, with states that are slightly disturbed."""
         T_cam_obj = pose_from_kitti(torch.stack([x_m, torch.full_like(x_m, _GROUND_Y_M), z_m], dim=-1), yaw_rad)
         if code is None:
             size = (self.num_states, self.prior.num_codes)
@@ -77,21 +77,21 @@ class Draw(NamedTuple):
         return DrawnStates(detections, self.disturbed(state, 0.05, 1.0, 0.0) if disturb else state)
 
     def anywhere(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Place and heading 8 to 25 m ahead."""
+        """Random x, z and heading, 8 to 25 m ahead."""
         z = self.uniform(8, 25)
         return 0.3 * z * self.uniform(-1, 1), z, self.yaw()
 
 
 @dataclass(frozen=True)
 class Regime:
-    """How states are drawn."""
+    """This regime says how states are drawn and which pixels are examined."""
 
     name: str  # of the regime
     explanation: str  # in a few words, for reports
     draw: Callable[[Draw], DrawnStates]  # the states
     pixels: Pixels = "sampled"  # which pixels of the cars take part
-    stage: int = 1  # of the settings: 1 is the fine one, 0 has a softer contour and half the image resolution
-    occlusion: bool = False  # whether cars hide one another; cars that were placed each on its own must not
+    stage: int = 1  # of the settings: 1 is the fine stage, 0 has a softer contour and half the image resolution
+    occlusion: bool = False  # whether cars hide one another; separately placed cars must not
 
 
 def _typical(d: Draw) -> DrawnStates:
@@ -100,7 +100,7 @@ def _typical(d: Draw) -> DrawnStates:
 
 
 def _near_optimum(d: Draw) -> DrawnStates:
-    # Wherever the optimum lies, whether its box is to be trusted is another question.
+    # Every optimum is wanted, whether its box is to be trusted or not.
     plain = RefinerConfig()
     alone = replace(plain.priors, detector_weight=0.0)
     every_result = replace(plain, acceptance=AcceptanceConfig(0.0, 0.0), rig=RigConfig(0.0), priors=alone)
@@ -119,7 +119,7 @@ def _near(d: Draw) -> DrawnStates:
 
 
 def _cut(d: Draw) -> DrawnStates:
-    """The middle of the car projects onto the left or right border of the image."""
+    """States of cars whose middle projects onto the left or right border of the image."""
     K, width = d.scene.frame.camera.K_left[0], float(d.scene.frame.sizes[0, 1])
     z = d.uniform(7, 14)
     border = torch.where(torch.arange(d.num_states) % 2 == 0, 0.0, width - 1.0)
@@ -137,7 +137,7 @@ def _with_offset(d: Draw) -> DrawnStates:
 
 
 def _track(d: Draw) -> DrawnStates:
-    """One car over and over, each state the next view of the one before; what the picture shows there is no matter."""
+    """States of one car, each the next view of the previous state; the image content does not matter."""
     detections = d.scene.detections
     d = d._replace(num_states=max(2, d.num_states))  # one view has no path
     drawn = d.of_frame(detections.T_cam_obj[:1], d.prior.initial_code(1), 0.15, 2.0, 0.8)
@@ -155,7 +155,7 @@ def _with_code(size: float) -> Callable[[Draw], DrawnStates]:
 
 
 def _with_yaw(*yaws: float) -> Callable[[Draw], DrawnStates]:
-    """Exact rotations, with no disturbance: the states where closed forms divide by an angle or lose the axis."""
+    """Draw exact rotations without disturbance, where closed forms divide by an angle or lose the axis."""
 
     def draw(d: Draw) -> DrawnStates:
         x, z, _ = d.anywhere()
@@ -189,10 +189,10 @@ REGIMES: Mapping[str, Regime] = {
 
 
 def regimes_named(names: list[str] | None) -> list[Regime]:
-    """The regimes of these names, all where None.
+    """The regimes with the given names, or all regimes for None.
 
     Raises:
-        InputError: an unknown name; lists the names.
+        InputError: a name is unknown; the error lists the known names.
 
     Examples:
         >>> [r.name for r in regimes_named(["far_80m"])]
@@ -202,10 +202,10 @@ def regimes_named(names: list[str] | None) -> list[Regime]:
 
 
 def checked_name(what: str, name: str, known: list[str]) -> str:
-    """The name itself if it is known.
+    """Return the name if it is known.
 
     Raises:
-        InputError: it is not; lists the names.
+        InputError: the name is unknown; the error lists the known names.
     """
     if name not in known:
         raise InputError(what, f"one of {', '.join(known)}", repr(name))
@@ -213,5 +213,5 @@ def checked_name(what: str, name: str, known: list[str]) -> str:
 
 
 def seeded(seed: int, regime: Regime) -> torch.Generator:
-    """A generator of a regime of its own: what is drawn does not depend on which other regimes are."""
+    """A separate generator for a regime, so that its draws do not depend on other regimes."""
     return torch.Generator().manual_seed(seed * 1000 + list(REGIMES).index(regime.name))

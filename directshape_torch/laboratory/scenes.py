@@ -1,4 +1,4 @@
-"""Real image content for the laboratory: frames of a data set, and cars placed into them at will."""
+"""This module gives the laboratory real images: frames of a data set, and cars placed into them."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from directshape_torch.terms.depth import march
 DEMO_FOLDER = Path(__file__).parents[1] / "assets" / "demo"
 
 _MASK_SAMPLES_PER_RAY = 24
-# Masks of near cars are drawn on a coarser lattice: the laboratory needs a plausible contour, not every pixel of it.
+# Masks of near cars are drawn on a coarser lattice, because the laboratory only needs a plausible contour.
 _MASK_ROWS = 30
 
 
 @dataclass(frozen=True)
 class LaboratoryScene:
-    """One frame with its detections, float64."""
+    """This is one frame with its detections, float64."""
 
     frame: FrameBatch
     detections: Detections
@@ -46,9 +46,9 @@ def load_scene(
 
     Args:
         data: folder that holds `training/`; None for the bundled frame.
-        frame_id: default the frame with most cars that have masks in both images.
-        detections_dir: default the first folder in `detections` of the data set.
-        masks: default `training/masks` of the data set.
+        frame_id: id of the frame. Default: the frame with most cars that have masks in both images.
+        detections_dir: folder of detections. Default: the first folder in `detections` of the data set.
+        masks: folder of masks. Default: `training/masks` of the data set.
 
     Raises:
         DataFormatError: a folder is missing or damaged.
@@ -85,7 +85,7 @@ def _detections_folder(root: Path) -> Path:
 
 
 def select_detections(d: Detections, rows: Tensor) -> Detections:
-    """Some of the detections, in that order; a row may be repeated. Other instances stay as occluders."""
+    """The detections `rows`, in the order of `rows`, which may repeat; other instances stay as occluders."""
     return d.rows(rows)
 
 
@@ -95,11 +95,11 @@ def place_cars(
     T_cam_obj: Tensor,  # (B, 4, 4)
     code: Tensor,  # (B, K)
 ) -> Detections:
-    """Detections of cars that are not in the picture: their true masks, over whatever the images show there."""
+    """Detections of cars that are not in the picture, with their true masks over the existing image content."""
     frame = scene.frame
     count, (height, width) = len(T_cam_obj), frame.images_left.shape[2:]
     corners = box_corners(T_cam_obj, prior.dimensions_mean_hwl.expand(count, 3))
-    # A car at the camera has corners behind it.
+    # A car close to the camera can have corners behind the camera.
     uv = project(torch.cat([corners[..., :2], corners[..., 2:].clamp_min(0.3)], dim=-1), frame.camera.K_left[0])
     limit = uv.new_tensor([width - 1, height - 1])
     box = torch.cat([uv.amin(dim=1).clamp_min(0).minimum(limit), uv.amax(dim=1).clamp_min(0).minimum(limit)], dim=1)
@@ -121,12 +121,12 @@ def place_cars(
 def _mask(
     scene: LaboratoryScene, prior: PCAShapePrior, T_cam_obj: Tensor, code: Tensor, side: str, box_left: Tensor
 ) -> Tensor:
-    """Silhouette (H, W) of one car, drawn on a lattice as fine as its size in the image needs."""
+    """Silhouette (H, W) of one car, drawn on a lattice that suits its size in the image."""
     camera = scene.frame.camera
     height, width = scene.frame.images_left.shape[2:]
     focal, depth = float(camera.K_left[0, 0, 0]), float(T_cam_obj[2, 3])
     stride = max(1, round(1.6 * focal / depth / _MASK_ROWS))
-    # Room for the largest shapes, and for the disparity in the right image.
+    # The margin leaves room for the largest shapes, and the shift for the disparity in the right image.
     u0, v0, u1, v1 = (int(x) for x in box_left)
     margin = round(0.8 * focal / depth)
     shift = round(focal * float(camera.baseline[0]) / depth) if side == "right" else 0

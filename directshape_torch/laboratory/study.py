@@ -1,4 +1,4 @@
-"""One run of the laboratory: which terms, in which regimes; what came of it, and as text."""
+"""This module runs the laboratory on chosen terms and regimes, and writes the results as text."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ SUBJECT_NAMES = (*TERM_NAMES, *TRACK_NAMES)
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """What to examine."""
+    """This plan says what to examine."""
 
     subjects: tuple[str, ...] = SUBJECT_NAMES  # terms by name
-    own_terms: tuple[TermFactory, ...] = ()  # make further terms, which are examined as the others
+    own_terms: tuple[TermFactory, ...] = ()  # factories of further terms to examine
     regimes: tuple[Regime, ...] = field(default_factory=lambda: tuple(regimes_named(None)))  # by name
     num_states: int = 8  # per regime
     seed: int = 0  # of the draws
@@ -39,10 +39,10 @@ class StudyPlan:
 
 
 def subjects_named(names: Sequence[str]) -> tuple[str, ...]:
-    """The terms of these names.
+    """The checked names of terms.
 
     Raises:
-        InputError: an unknown name; lists the names.
+        InputError: a name is unknown; the error lists the known names.
 
     Examples:
         >>> subjects_named(["photometric"])
@@ -53,7 +53,7 @@ def subjects_named(names: Sequence[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class StudyResult:
-    """What a study found."""
+    """This is what a study found."""
 
     comparisons: tuple[Comparison, ...]  # one for each subject and regime
     states_without_pixels: dict[str, int]  # how many states of each regime saw no pixel at all
@@ -69,10 +69,10 @@ def run_study(
     plan: StudyPlan,
     report: Callable[[str], None] = lambda _: None,
 ) -> StudyResult:
-    """Examine everything that a plan names; `report` hears one line for each regime.
+    """Examine everything that a plan names; `report` gets a line for each regime.
 
     Raises:
-        InputError: none of the regimes has any of the terms; those of a track are in its regime alone.
+        InputError: none of the regimes has any of the terms. Terms of a track exist only in the regime of a track.
     """
     comparisons: list[Comparison] = []
     without: dict[str, int] = {}
@@ -94,7 +94,7 @@ def run_study(
 
 @torch.no_grad()
 def compare_subjects(bench: Bench, names: Sequence[str], second: bool = False) -> list[Comparison]:
-    """The three Jacobians of the named terms at the states of a bench, and those of their gradients."""
+    """Compare three Jacobians of the named terms at the states of a bench; `second` adds the terms' gradients."""
     terms = [name for name in names if name in bench.terms]
     experiments = [term_experiment(bench, terms)] if terms else []
     twice = [name for name in terms if name not in AT_FIXED_DEPTHS]
@@ -112,7 +112,7 @@ def _in_a_line(found: Sequence[Comparison]) -> str:
 
 
 def write_report(out: Path, source: str, plan: StudyPlan, study: StudyResult) -> None:
-    """`jacobians.csv`, a line for each comparison with its exclusions by reason, and `summary.md`."""
+    """Write `jacobians.csv`, with a line for each comparison and its exclusions by reason, and `summary.md`."""
     rules = sorted({rule for c in study.comparisons for rule in c.excluded})
     rows: list[list[Any]] = [[
         "subject", "regime", "entries", "compared", "zero_rows", "value_error", *BOUNDS,
@@ -129,7 +129,7 @@ def write_report(out: Path, source: str, plan: StudyPlan, study: StudyResult) ->
 
 
 def summary(source: str, plan: StudyPlan, study: StudyResult) -> str:
-    """One page: verdict, the worst of each subject, exclusions."""
+    """A summary on one page: the verdict, the largest errors of each subject, and exclusions."""
     broken = study.broken_bounds()
     parts = [
         "# Jacobians three ways",
@@ -150,7 +150,7 @@ def summary(source: str, plan: StudyPlan, study: StudyResult) -> str:
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """A Markdown table, nothing without rows."""
+    """A Markdown table, or an empty text if there are no rows."""
     if not rows:
         return ""
     lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
