@@ -51,7 +51,7 @@ class CarProblem:
     evidence: tuple[Evidence, ...]  # what the summands of the energy are made of
     extra_terms: tuple[Term, ...]  # a user's own summands, whose columns come last
     masks: MaskRows  # the rays of both images, left ones first, used by everything that looks at a state
-    rays: tuple[Rays, Rays]  # the rays of the left image and those of the right image
+    rays: tuple[Rays, Rays]  # the rays of the left image and the rays of the right image
     config: RefinerConfig  # stages, trust region, samples per ray
     # These factors (B, T) multiply the columns of costs of each car in addition to the weights of the terms. None
     # stands for 1.
@@ -352,7 +352,7 @@ def method_stages(config: RefinerConfig) -> list[StageConfig]:
     """Stages of `config.method`: "geometric" has its own rounds, other methods have the configured stages."""
     if config.method != "geometric":
         return list(config.stages)
-    # Contour and pyramid level do not affect a point cloud. They are those of the last stage, for pictures and
+    # Contour and pyramid level do not affect a point cloud. The values of the last stage are taken, for pictures and
     # measurements.
     last, cloud = config.stages[-1], config.point_cloud
     pose_stage, shape_stage, joint_stage = (

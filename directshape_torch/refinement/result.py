@@ -303,7 +303,7 @@ class RefinementResult(CarRecord):
         if frame not in ("ref", "cam"):
             raise InputError("frame", "'cam' or 'ref'", repr(frame))
         T = self.T_ref_obj if frame == "ref" else self.T_cam_obj
-        # A car whose shape was not refined keeps the detector's dimensions and does not get those of the mean shape.
+        # A car whose shape was not refined keeps the detector's dimensions, not the mean shape's.
         rows = (self.refined & self.has_shape).nonzero()[:, 0]
         bottom, hwl = level_boxes(self.prior, T[rows], self.code[rows])
         dimensions = self.input_dimensions_hwl.index_copy(0, rows, hwl)
