@@ -33,7 +33,7 @@ from directshape_torch.state.cars import CarBatch, CarState
 
 
 class KnownRig(Protocol):
-    """This is what is known of the rig that frames come from, such as a `rig.estimate.RigEstimate`."""
+    """This is what is known of the rig that frames come from, for example a `rig.estimate.RigEstimate`."""
 
     def corrected(self, frames: FrameBatch) -> FrameBatch:
         """Frames whose camera has the rig's disparity field."""
@@ -108,8 +108,8 @@ class DirectShapeRefiner(nn.Module):
         detector has standard deviations or if results are combined with the detector's boxes (`weighs_detector`).
 
         Args:
-            frames: F frames; dtype and device must be those of the prior.
-            detections: B cars in any order; their dtype follows that of the frames.
+            frames: F frames with dtype and device of the prior.
+            detections: B cars in any order; they are converted to the dtype of the frames.
             term_weights: factors (B,) of named terms for each car, for example how far a network trusts a term. They
                 multiply the weights of the configuration.
 
@@ -246,7 +246,7 @@ class DirectShapeRefiner(nn.Module):
         if self.rig is None:
             return frames, detections
         informed = self.rig.informed(frames, detections)
-        # Standard deviations of the settings take precedence over those of the rig.
+        # Standard deviations of the settings take precedence over the rig's.
         if any(self.config.priors.pose_sigmas):
             informed = replace(informed, pose_sigma=detections.pose_sigma)
         # Points and boxes of the other methods have no unknown offset.
