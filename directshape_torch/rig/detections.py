@@ -94,7 +94,7 @@ _LARGEST_OFFSET_PX, _LARGEST_SHARE = 2.0, 0.4
 # This is the standard deviation between the side of a car and the side of its box, whose dimensions are guesses.
 _SURFACE_SIGMA_M = 0.15
 _TO_SIGMA = 1.4826  # sigma over the median absolute deviation
-_MEDIAN_TO_MEAN = 1.57  # variance of a median over that of a mean
+_MEDIAN_TO_MEAN = 1.57  # variance of a median over the variance of a mean
 
 
 def observe_detections(frames: FrameBatch, detections: Detections) -> Tensor:  # (N, 8)

@@ -198,7 +198,7 @@ class RigEstimate(nn.Module):
 
         The bias of the detector adds to its standard deviation, and the prior stays at the box. If the field is a
         guess, each car gets an unknown offset, so that contours and box influence its depth. The sigma of a better
-        known field widens the standard deviation of the result's depth and does not change the depth, because such a
+        known field widens the standard deviation of the result's depth and does not change the depth, because this
         field knows more than contours.
 
         Args:

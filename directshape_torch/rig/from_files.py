@@ -198,7 +198,7 @@ def gaps(frame_ids: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def observe_motion(frames: Iterable[FrameFiles], height_m: float | None) -> list[FieldConstraint]:
-    """Read frames of one rig one after the other and collect constraints; those of the road need `height_m`.
+    """Read frames of one rig one after the other and collect constraints; constraints of the road need `height_m`.
 
     The caller may pass an iterator that shows progress.
     """

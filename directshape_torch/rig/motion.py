@@ -210,7 +210,7 @@ class MotionConstraint(FieldConstraint):
         return columns[..., 0], columns[..., 1:]
 
     def inverse_depth(self, coefficients: Tensor) -> Tensor:
-        """Best inverse depths (P,) for motion and field, by a few Gauss-Newton steps from those of the disparity."""
+        """Best inverse depths (P,) for motion and field, by a few Gauss-Newton steps from the measured disparity."""
         bias = polynomial_basis(self.uv, self.rig.size_wh) @ coefficients
         inverse_depth = (1 / self.rig.depth(self.uv, self.seen[:, 2] - bias)).nan_to_num(nan=_SMALLEST_INVERSE_DEPTH)
         for _ in range(_DEPTH_ITERATIONS):
