@@ -342,8 +342,8 @@ def test_a_term_that_sees_the_offset_alone_says_nothing_where_the_rig_is_known()
     torch.testing.assert_close(found.T_cam_obj, refine().T_cam_obj, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("sees", [("poses",), "pose", ("pose", "pose"), ("path",)])
-def test_blocks_that_no_car_has_are_named(sees: Any) -> None:
+@pytest.mark.parametrize("sees", [("poses",), "pose", ("pose", "pose"), ("path",), ("code", "pose")])
+def test_blocks_that_no_car_has_or_in_another_order_are_named(sees: Any) -> None:
     with pytest.raises(InputError, match=r"'user': sees: expected names of blocks of unknowns.*'offset'"):
         refine(lambda *scene: PriorTerm("user", 1.0, scene[2], lower_by(0.1), 1, sees))
 

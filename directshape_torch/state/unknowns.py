@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate, pairwise
 from typing import Literal, NamedTuple, Protocol, TypeVar
 
 import torch
@@ -113,7 +112,8 @@ class Unknowns:
 
     def span(self, *names: str) -> slice:
         """The columns of adjacent blocks."""
-        first, last = (self._names().index(name) for name in (names[0], names[-1]))
+        all_names = [block.name for block in self.blocks]
+        first, last = (all_names.index(name) for name in (names[0], names[-1]))
         between = [block for block in self.blocks[first : last + 1] if block.size or block.name in names]
         assert tuple(block.name for block in between) == names, f"{names} do not stand beside each other"
         start = sum(block.size for block in self.blocks[:first])
@@ -129,9 +129,9 @@ class Unknowns:
         return torch.cat([number[self.span(name)] for name in names])
 
     def placed(self, J: Tensor, sees: Sequence[str]) -> Tensor:
-        """A Jacobian (..., D) by all unknowns, from a Jacobian by the blocks that a residual `sees`, in this order.
+        """A Jacobian (..., D) by all unknowns, from a Jacobian by the blocks that a residual `sees`.
 
-        A Jacobian that already has all D columns is returned unchanged.
+        The blocks have the order of the state. A Jacobian that already has all D columns is returned unchanged.
 
         Examples:
             >>> Unknowns(blocks_of_car(num_codes=2, num_offsets=1)).placed(torch.ones(1, 2), ["code"])
@@ -182,24 +182,15 @@ class Unknowns:
 
     def moving(self, moves: Literal["both", "pose", "shape"], device: torch.device) -> Tensor:
         """Mask (D,) of the unknowns that a stage moves."""
-        moved = [block.belongs_to in (None, moves) or moves == "both" for block in self.blocks]
-        return self._by_column(moved, device)
+        by_column = [
+            moves == "both" or block.belongs_to in (None, moves) for block in self.blocks for _ in range(block.size)
+        ]
+        return torch.tensor(by_column, dtype=torch.bool, device=device)
 
     def free(self, state: State, max_code: float) -> Tensor:
         """Mask (B, D) of the unknowns that may move: a code component at its bound is a constant."""
         free = torch.ones_like(state.code[:, :1], dtype=torch.bool).expand(-1, self.size).clone()
-        values = zip(self.blocks, state, pairwise(self._borders()), strict=True)
-        for block, value, (first, last) in values:
+        for block, value in zip(self.blocks, state, strict=True):
             if block.is_bounded:
-                free[:, first:last] = value.abs() < max_code
+                free[:, self.span(block.name)] = value.abs() < max_code
         return free
-
-    def _names(self) -> list[str]:
-        return [block.name for block in self.blocks]
-
-    def _borders(self) -> list[int]:
-        return list(accumulate((block.size for block in self.blocks), initial=0))
-
-    def _by_column(self, flags: Sequence[bool], device: torch.device) -> Tensor:
-        by_column = [flag for block, flag in zip(self.blocks, flags, strict=True) for _ in range(block.size)]
-        return torch.tensor(by_column, dtype=torch.bool, device=device)

@@ -36,8 +36,8 @@ def check_members(term: Term) -> None:
     if not (isinstance(names, tuple) and names and all(isinstance(name, str) for name in names)):
         raise InputError(f"extra term {type(term).__name__}: names", "a tuple of at least one str", repr(names))
     sees = term.sees
-    if not (isinstance(sees, tuple) and set(sees) <= set(_BLOCKS) and len(set(sees)) == len(sees)):
-        cure = f"a tuple of some of {', '.join(map(repr, _BLOCKS))}"
+    if sees != tuple(block for block in _BLOCKS if block in sees):
+        cure = f"a tuple of some of {', '.join(map(repr, _BLOCKS))}, in this order"
         raise InputError(f"extra term {names[0]!r}: sees", "names of blocks of unknowns", repr(sees), cure)
 
 

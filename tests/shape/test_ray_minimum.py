@@ -265,7 +265,7 @@ def test_the_best_depth_is_the_one_of_least_distance() -> None:
 
 
 def _grid(values: Tensor) -> GridField:
-    """Of distances (nx, ny) at nodes 0.1 m apart, alike for all z."""
+    """The grid has distances (nx, ny) at nodes 0.1 m apart, equal for all z."""
     nodes = values.double()[None, ..., None].expand(1, *values.shape, 3).contiguous()
     return GridShape(nodes, torch.zeros(*values.shape, 3, 1).double(), torch.zeros(3).double(), 0.1).field
 
@@ -284,7 +284,7 @@ def test_a_search_ends_where_it_began_beside_another_face() -> None:
 
 
 def test_curvature_is_that_of_the_cell_in_which_the_point_lies() -> None:
-    """Of one raised node: `x y` in the cell before the face, `(1 - x) y` behind it."""
+    """One node is raised: the distance is `x y` in the cell before the face and `(1 - x) y` behind it."""
     raised = torch.zeros(5, 5)
     raised[2, 2] = 1.0
     direction = torch.tensor([1.0, 1.0, 0.0]).double().view(3, 1, 1)
