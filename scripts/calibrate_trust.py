@@ -6,6 +6,7 @@
 DETECTIONS are a folder of result files, or `stereo` or `mono`: a detector that is simulated from labels, ten times.
 A run learns what its detector is off by from its own results, never from labels. Labels tell what the images are off by
 and, beside boxes and masks that are laid on other images, when a car is there; each draw counts as much as another.
+Boxes with the mask of their neighbour in the image are judged, too, but nothing is fitted to them.
 Each run is judged by what other roots (by the names of their folders) with other detectors have told, where all runs
 have such; cars that the package refuses for want of evidence take no part.
 Written to OUT: the draws, `report.md`, and `trust_model.json`, fitted to all.
@@ -64,8 +65,8 @@ def runs_of(args: argparse.Namespace) -> list[Cars]:
 
 def _refined(run: tuple[Path, Path, Path, str, bool], overrides: Sequence[str], by_frame: bool) -> bytes:
     """The cars of a run, in one piece: tensors by themselves would each take an open file with them."""
-    root, detections, masks, name, with_elsewhere = run
-    found = refined_cars(root, detections, masks, name, overrides, with_elsewhere and not by_frame, by_frame)
+    root, detections, masks, name, with_wrong = run
+    found = refined_cars(root, detections, masks, name, overrides, with_wrong and not by_frame, by_frame)
     count = sum(len(frame.result) for frame in found.frames)
     print(f"{root.name} {detections.name}: {count} cars", file=sys.stderr, flush=True)
     return pickle.dumps(found)
@@ -121,16 +122,17 @@ class JudgedRow(NamedTuple):
 
     cars: list[Judged]
     elsewhere: list[Judged]
+    swapped: list[Judged]
     model: TrustModel
 
-    def returned(self, limits: AcceptanceConfig) -> list[NDArray[np.bool_]]:
-        """Which boxes of each run come back."""
-        return [returned(each, self.model.car_is_there, limits) for each in self.cars]
+    def returned(self, cars: list[Judged], limits: AcceptanceConfig) -> list[NDArray[np.bool_]]:
+        """Which boxes of some runs of the row come back, run by run."""
+        return [returned(each, self.model.car_is_there, limits) for each in cars]
 
-    def chosen(self, limits: AcceptanceConfig) -> list[Array]:
+    def chosen(self, cars: list[Judged], limits: AcceptanceConfig) -> list[Array]:
         """Overlaps of what comes back, run by run."""
-        pairs = zip(self.returned(limits), self.cars, strict=True)
-        return [np.where(kept, cars.after, cars.before) for kept, cars in pairs]
+        pairs = zip(self.returned(cars, limits), cars, strict=True)
+        return [np.where(kept, each.after, each.before) for kept, each in pairs]
 
 
 Rows: TypeAlias = Mapping[tuple[str, str], JudgedRow]
@@ -139,24 +141,31 @@ Rows: TypeAlias = Mapping[tuple[str, str], JudgedRow]
 
 def _judged(runs: Sequence[Cars], row: tuple[str, str], model: TrustModel) -> JudgedRow:
     some, noise = [run for run in runs if (run.root, run.detector) == row], model.image_noise
-    elsewhere = [run.judged(noise, elsewhere=True) for run in some if run.elsewhere]
-    return JudgedRow([run.judged(noise) for run in some], elsewhere, model)
+    elsewhere = [run.judged(noise, run.elsewhere) for run in some if run.elsewhere]
+    swapped = [run.judged(noise, run.swapped) for run in some if run.swapped]
+    return JudgedRow([run.judged(noise, run.frames) for run in some], elsewhere, swapped, model)
 
 
 def _policies(rows: Rows, limits: AcceptanceConfig) -> str:
     """What comes back, a row for each detector on each root: means over the draws, with their standard deviation."""
     head = "cars", "runs, cars", "input", "images alone (worse)", "most probable (worse)", "returned (worse, share)"
-    lines = ["| " + " | ".join((*head, "elsewhere")) + " |", "|" + "---|" * 7]
+    wrong = "returned on other images", "returned worse with a neighbour's mask"
+    lines = ["| " + " | ".join((*head, *wrong)) + " |", "|" + "---|" * 8]
     for (root, detector), row in rows.items():
-        cars, share = row.cars, np.mean([kept.mean() for kept in row.returned(limits)])
+        cars, share = row.cars, np.mean([kept.mean() for kept in row.returned(row.cars, limits)])
         inputs = _spread([float(each.before.mean()) for each in cars])
         cells = [_cell(cars, [each.images for each in cars]), _cell(cars, [each.after for each in cars])]
-        cells.append(f"{_cell(cars, row.chosen(limits))[:-1]}, {share:.0%})")
-        there = [returned(each, row.model.car_is_there, limits) for each in row.elsewhere]
-        cells.append(f"{sum(kept.sum() for kept in there)} of {sum(map(len, there))}" if there else "")
+        cells.append(f"{_cell(cars, row.chosen(row.cars, limits))[:-1]}, {share:.0%})")
+        there = row.returned(row.elsewhere, limits)
+        pairs = zip(row.chosen(row.swapped, limits), row.swapped, strict=True)
+        cells += [_count(there), _count([after < each.before - WORSE_BY for after, each in pairs])]
         counts = f"{len(cars)}, {np.mean([len(each.before) for each in cars]):.0f}"
         lines.append(f"| {root} {detector} | {counts} | {inputs} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def _count(flags: Sequence[NDArray[np.bool_]]) -> str:
+    return f"{sum(each.sum() for each in flags)} of {sum(map(len, flags))}" if flags else ""
 
 
 def _thresholds(rows: Rows, limits: AcceptanceConfig) -> str:
@@ -167,7 +176,7 @@ def _thresholds(rows: Rows, limits: AcceptanceConfig) -> str:
         cells = []
         for least in THRESHOLDS:
             other = replace(limits, min_probability_not_worse=least)
-            cells.append(_cell(row.cars, row.chosen(other), with_spread=False))
+            cells.append(_cell(row.cars, row.chosen(row.cars, other), with_spread=False))
         lines.append(f"| {root} {detector} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 

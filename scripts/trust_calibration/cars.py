@@ -1,4 +1,4 @@
-"""Refined cars with labels, and boxes refined where no car is."""
+"""This module refines cars with labels, boxes on images where no car is, and boxes with the masks of other cars."""
 
 from __future__ import annotations
 
@@ -60,19 +60,19 @@ class Judged(NamedTuple):
 
 @dataclass(frozen=True)
 class Cars:
-    """The refined cars of one run, and those of its boxes and masks on other images."""
+    """`Cars` are the refined cars of one run."""
 
     root: str
     detector: str
     frames: list[Frame]
-    elsewhere: list[Frame]
+    elsewhere: list[Frame]  # boxes and masks on other images
+    swapped: list[Frame]  # each box with the mask of its neighbour in the image, which itself is not detected
     by_frame: bool  # rig and detector are what each frame tells by itself
 
-    def compared(self, noise: ImageNoise, elsewhere: bool = False) -> list[tuple[Frame, CarBatch, DetectorComparison]]:
-        """Each frame as this image noise has it, with the detector's noise that the run learns by it."""
+    def compared(self, noise: ImageNoise, frames: list[Frame]) -> list[tuple[Frame, CarBatch, DetectorComparison]]:
+        """Frames of the run as this image noise has them, with the detector's noise that the run learns by it."""
         rows = [rows_of(compared(frame.result, frame.cars, noise)) for frame in self.frames]
         of_run = [detector_sigmas(torch.cat(rows))]
-        frames = self.elsewhere if elsewhere else self.frames
         sigmas = [detector_sigmas(own) for own in rows] if self.by_frame else of_run * len(frames)
         found = []
         for frame, known in zip(frames, sigmas, strict=True):
@@ -80,13 +80,13 @@ class Cars:
             found.append((frame, cars, compared(frame.result, cars, noise)))
         return found
 
-    def evidence(self, noise: ImageNoise, elsewhere: bool = False) -> Array:
-        """Whether each car is there (N, E), as this image noise has it."""
-        return np.concatenate([_evidence(frame, at) for frame, _, at in self.compared(noise, elsewhere)])
+    def evidence(self, noise: ImageNoise, frames: list[Frame]) -> Array:
+        """What says whether each car of some frames of the run is there (N, E), as this image noise has it."""
+        return np.concatenate([_evidence(frame, at) for frame, _, at in self.compared(noise, frames)])
 
-    def judged(self, noise: ImageNoise, elsewhere: bool = False) -> Judged:
-        """All cars as this image noise has them."""
-        parts = [_judged(*each, noise) for each in self.compared(noise, elsewhere)]
+    def judged(self, noise: ImageNoise, frames: list[Frame]) -> Judged:
+        """All cars of some frames of the run as this image noise has them."""
+        parts = [_judged(*each, noise) for each in self.compared(noise, frames)]
         return Judged(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def overlaps(self) -> tuple[Array, Array]:
@@ -141,7 +141,7 @@ def refined_cars(
     masks: Path,
     detector: str,
     overrides: Sequence[str],
-    with_elsewhere: bool,
+    with_wrong: bool,
     by_frame: bool,
 ) -> Cars:
     """All cars of a run, whose rigs are estimated from its detections, every result returned."""
@@ -159,8 +159,9 @@ def refined_cars(
             refiner.rig = RigEstimate.of_frames(each.frame)
             refiner.rig.update(each.frame, each.detections)
         frames += _with_labels(refiner, each)
-    elsewhere = _elsewhere(refiner, loaded) if with_elsewhere else []
-    return Cars(root.name, detector, frames, elsewhere, by_frame)
+    elsewhere = _elsewhere(refiner, loaded) if with_wrong else []
+    swapped = [frame for each in loaded for frame in _swapped(refiner, each)] if with_wrong else []
+    return Cars(root.name, detector, frames, elsewhere, swapped, by_frame)
 
 
 def _with_labels(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> list[Frame]:
@@ -190,6 +191,26 @@ def _elsewhere(refiner: DirectShapeRefiner, loaded: Sequence[LoadedFrame]) -> li
         rows = [row for row in range(len(result)) if is_free[row] and result.refined[row]]
         if rows:
             frames.append(_frame(_corrected(refiner, other), result, each.detections, rows, None))
+    return frames
+
+
+def _swapped(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> list[Frame]:
+    """Each labelled car by itself with the masks of its neighbour in the image, as if that were not detected."""
+    found = match_to_labels(loaded.detected_objects, loaded.labels or [])
+    centre = np.array([(o.box_2d[0] + o.box_2d[2], o.box_2d[1] + o.box_2d[3]) for o in loaded.detected_objects])
+    frames = []
+    for row, label in found.items():
+        if not is_counted(label) or len(centre) < 2:
+            continue
+        distance = np.linalg.norm(centre - centre[row], axis=1)
+        distance[row] = np.inf
+        own, neighbour = torch.tensor([row]), torch.tensor([int(distance.argmin())])
+        masks = {side: getattr(loaded.detections, side).rows(neighbour) for side in ("mask_left", "mask_right")}
+        one = replace(loaded.detections.rows(own), **masks)
+        with torch.no_grad():
+            result = refiner(loaded.frame, one)
+        boxes = boxes_of([loaded.detected_objects[row]]), boxes_of([label])
+        frames += [_frame(_corrected(refiner, loaded), result, one, [0], boxes)] if result.refined[0] else []
     return frames
 
 

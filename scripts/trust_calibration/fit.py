@@ -44,8 +44,8 @@ def evidence_of(runs: Sequence[Cars], noise: ImageNoise) -> tuple[Array, Array]:
     there, not_there = [], [np.empty((0, len(EVIDENCE_NAMES)))]
     for run in runs:
         before, images = run.overlaps()
-        there.append(run.evidence(noise)[images > np.minimum(_LEAST_IOU, before - WORSE_BY)])
-        not_there += [run.evidence(noise, elsewhere=True)] if run.elsewhere else []
+        there.append(run.evidence(noise, run.frames)[images > np.minimum(_LEAST_IOU, before - WORSE_BY)])
+        not_there += [run.evidence(noise, run.elsewhere)] if run.elsewhere else []
     return np.concatenate(there), np.concatenate(not_there)
 
 
