@@ -1,5 +1,5 @@
-"""Reading and writing files: data sets in KITTI's and other layouts, masks, results and manifests.
+"""This package reads and writes files: data sets in KITTI's and other layouts, masks, results and manifests.
 
-What is missing, damaged or not as its format demands raises `DataFormatError`, which names the file, the line where it
-has lines, and a cure; wrong arguments raise `InputError`.
+A file that is missing, damaged or not in the expected format raises `DataFormatError`, which names the file, the line
+number if there is one, and a cure. Wrong arguments raise `InputError`.
 """

@@ -1,4 +1,4 @@
-"""Settings from and to YAML: files, `key=value` overrides, nested mappings. What is allowed follows `config`."""
+"""This module converts settings from and to YAML files, `key=value` overrides and nested mappings."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from directshape_torch.errors import ConfigError, shown
 from directshape_torch.files.read_files import read_text
 
 BUNDLED_CONFIGS = ("default", "paper", "fast")
-"""Names of the settings that come with the package, for `load_config`."""
+"""These are the names of the settings that come with the package, for `load_config`."""
 
-# The parser takes a second for ten thousand lines.
+# The YAML parser takes a second for ten thousand lines.
 _MOST_BYTES = 2**20
 _CONFIG_FOLDER = Path(__file__).parents[1] / "assets" / "configs"
-# Of two names: a misspelt one has most of its letters.
+# A misspelt name and the right one have a similarity above this, because they share most of their letters.
 _ALIKE = 0.6
 _KINDS = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
 _GroupT = TypeVar("_GroupT", bound=Settings)
@@ -31,13 +31,13 @@ def config_from_mapping(cls: type[_GroupT], mapping: Mapping[str, Any], where: s
     """A group of settings from nested mappings; missing keys keep their defaults.
 
     Args:
-        cls: such as `RefinerConfig`.
+        cls: class of the settings, such as `RefinerConfig`.
         mapping: keys and values, as they come from YAML or JSON.
-        where: what stands before the keys in errors, such as "refiner.".
+        where: prefix of the keys in errors, such as "refiner.".
 
     Raises:
-        ConfigError: an unknown key (naming the nearest one, or all of its group), or a value of the wrong kind or out
-            of range.
+        ConfigError: a key is unknown (the error names the nearest one, or all keys of the group), or a value is of the
+            wrong kind or out of range.
 
     Examples:
         >>> config_from_mapping(RefinerConfig, {"silhouette": {"weight": 6}}).silhouette.weight
@@ -47,7 +47,7 @@ def config_from_mapping(cls: type[_GroupT], mapping: Mapping[str, Any], where: s
 
 
 def _from_mapping(cls: type[_GroupT], mapping: Mapping[str, Any], where: str, known: Mapping[str, str]) -> _GroupT:
-    """The group whose keys follow `where`; `known`: names of all settings by their paths."""
+    """The group of settings whose keys follow `where`; `known` maps paths of all settings to their names."""
     if not isinstance(mapping, Mapping):
         raise ConfigError(f"{where.rstrip('.') or 'configuration'}: expected keys and values, got {shown(mapping)}")
     hints = cls.types()
@@ -62,9 +62,8 @@ def _from_mapping(cls: type[_GroupT], mapping: Mapping[str, Any], where: str, kn
 
 
 def _other_keys(key: str, where: str, here: Sequence[str], known: Mapping[str, str]) -> str:
-    """The nearest key of the same group, or one of another group whose own name is nearer still, or else all of the
-    group."""
-    # Of equally near ones the first, which is of the same group.
+    """Advice that names the key nearest to a misspelt one, or all keys of the group if none is near."""
+    # Among equally near keys the first is taken, which belongs to the same group.
     names = {**{f"{where}{name}": name for name in here}, **known}
     likeness = {path: difflib.SequenceMatcher(None, name, key).ratio() for path, name in names.items()}
     nearest = max(likeness, key=likeness.__getitem__)
@@ -72,7 +71,7 @@ def _other_keys(key: str, where: str, here: Sequence[str], known: Mapping[str, s
 
 
 def _leaves(cls: type[Any]) -> Iterator[str]:
-    """Dotted paths of all settings; those of a list's entries as if there were one entry."""
+    """Dotted paths of all settings; a list counts as if it had one entry."""
     for name, hint in cls.types().items():
         kind = next((kind for kind in (hint, *typing.get_args(hint)) if _is_group(kind)), None)
         yield from [name] if kind is None else (f"{name}.{leaf}" for leaf in _leaves(kind))
@@ -83,7 +82,7 @@ def _is_group(hint: Any) -> bool:
 
 
 def _convert(hint: Any, value: Any, where: str, known: Mapping[str, str]) -> Any:
-    """A value as its type has it; limits and words are the group's own matter."""
+    """A value converted to the type of its setting; the group itself checks limits and words."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if _is_group(hint):
         return _from_mapping(hint, value, f"{where}.", known)
@@ -109,7 +108,7 @@ def _entries(arguments: Sequence[Any], value: Any, where: str) -> list[tuple[Any
 def _convert_scalar(hint: type[Any], value: Any, where: str) -> Any:
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if hint is float and isinstance(value, str):
-        # YAML 1.1 reads 1e7 (no point) as text.
+        # YAML 1.1 reads 1e7 (without a point) as text.
         with contextlib.suppress(ValueError):
             return float(value)
     if hint is float and is_number:
@@ -125,12 +124,13 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -
     """Read a YAML file and apply `key.sub=value` overrides (values in YAML).
 
     Args:
-        path: the file, or the name of one that comes with the package: "default", "paper" or "fast". None for the
-            defaults. A file of such a name in the working folder is "./paper".
+        path: the file, or the name of bundled settings: "default", "paper" or "fast". None gives the defaults. A file
+            with such a name in the working folder is given as "./paper".
         overrides: for example `["silhouette.weight=6", "solver.max_code=2.5"]`.
 
     Raises:
-        ConfigError: unreadable file, unknown key, a value of the wrong kind or out of range; names file and overrides.
+        ConfigError: the file is unreadable, a key is unknown, or a value is of the wrong kind or out of range. The
+            error names the file and the overrides.
 
     Examples:
         >>> load_config(None, ["solver.max_code=2.5"]).solver.max_code
@@ -158,7 +158,7 @@ def _read(path: Path | str) -> dict[str, Any]:
     file = _CONFIG_FOLDER / f"{path}.yaml" if str(path) in BUNDLED_CONFIGS else Path(path)
     try:
         mapping = yaml.safe_load(read_text(file, _MOST_BYTES)) or {}
-    # Of dates that are none, deep nesting and the like the parser raises whatever it comes across.
+    # The parser raises many types of errors, for example for impossible dates and for deep nesting.
     except Exception as error:
         names = f"bundled ones are {', '.join(BUNDLED_CONFIGS)}"
         raise ConfigError(f"{path}: cannot be read as a YAML configuration: {error}; {names}") from error

@@ -1,6 +1,6 @@
-"""The JSON files of a plain folder for a stereo rig of one's own: `rig.json`, and one a frame (docs/plain_folder.md).
+"""This module reads the JSON files of a plain folder for a user's own stereo rig (docs/plain_folder.md).
 
-The frame of boxes and planes is the left camera's: `ref` is `cam`.
+They are `rig.json` and one file for each frame. Boxes and planes are in the left camera frame, so `ref` is `cam`.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ _CURE = "see docs/plain_folder.md"
 _Triple = tuple[float, float, float]
 _Row = tuple[float, float, float, float]
 _CAR = "Car"
-# KITTI's numbers for what a line does not have.
+# KITTI writes these numbers for columns without a value.
 _NO_BOX_3D = "-1 -1 -1 -1000 -1000 -1000 -10"
 _BOX_KEYS = ("dimensions_hwl_m", "bottom_center_m", "rotation_y_rad")
 
 
 @dataclass(frozen=True)
 class FolderRig:
-    """`rig.json`: the rectified pair."""
+    """A `FolderRig` is the content of `rig.json`, the rectified pair."""
 
     image_size_wh: tuple[int, int]  # pixels
-    # Intrinsics, (3, 3), pixels; `K_right` None: as the left ones.
+    # Intrinsics, (3, 3), pixels; None for `K_right` means that it equals `K_left`.
     K_left: tuple[_Triple, _Triple, _Triple]
     K_right: tuple[_Triple, _Triple, _Triple] | None = None
-    baseline_m: float | None = None  # of the cameras, or
+    baseline_m: float | None = None  # distance of the cameras; either this or `t_right_cam_m` is given
     t_right_cam_m: _Triple | None = None  # `x_right = x_cam + t_right_cam_m`
-    comment: Any = None  # whatever its owner says
+    comment: Any = None  # any remark of the user
 
     def projections(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """P2 and P3 (3, 4), with the left camera's frame as `ref`."""
@@ -62,10 +62,10 @@ class FolderRig:
 
 @dataclass(frozen=True)
 class FolderObject:
-    """One entry of `objects` or `labels` of a frame; without any of the box's three keys it has no 3D box."""
+    """A `FolderObject` is one entry of `objects` or `labels` of a frame; it has all or none of the 3D box keys."""
 
     object_class: str  # such as "Car"; "class" in the file
-    score: float = 1.0  # the detector's
+    score: float = 1.0  # confidence of the detector
     # (u_min, v_min, u_max, v_max) in the left image, pixels, or None.
     box_2d: tuple[float, float, float, float] | None = None
     dimensions_hwl_m: _Triple | None = None  # height, width, length
@@ -74,20 +74,20 @@ class FolderObject:
     # The path of a PNG, a COCO segmentation, or None.
     mask_left: Any = None
     mask_right: Any = None
-    track_id: int = -1  # number of the car over the frames, -1 where there is none
+    track_id: int = -1  # number of the car in all frames, -1 for none
 
 
 @dataclass(frozen=True)
 class FolderFrame:
-    """`frames/ID.json`."""
+    """A `FolderFrame` is the content of `frames/ID.json`."""
 
     objects: Sequence[FolderObject]  # detections, and other instances that may hide them
     labels: Sequence[FolderObject] | None = None  # the ground truth, or None
     ground_plane: _Row | None = None  # (a, b, c, d), a x + b y + c z + d = 0 in the left camera frame, or None
-    time_s: float | None = None  # when it was taken, seconds from any beginning that keeps them small, or None
+    time_s: float | None = None  # time of the frame, seconds from any start that keeps them small, or None
     # Pose of the left camera in a world that all frames share, or None.
     T_world_cam: tuple[_Row, _Row, _Row, _Row] | None = None
-    comment: Any = None  # whatever its owner says
+    comment: Any = None  # any remark of the user
 
 
 def read_rig(path: Path) -> FolderRig:
@@ -142,25 +142,25 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def calibration_of(path: Path) -> KittiCalibration:
-    """The projections of `rig.json`."""
+    """The projection matrices of `rig.json`."""
     rig = read_rig(path)
     width, height = rig.image_size_wh
     return KittiCalibration(path, *rig.projections(), size_wh=(width, height), names=("K_left", "K_right"))
 
 
 def detections_of(path: Path, rig_path: Path) -> list[KittiObject]:
-    """The entries of `objects` as KITTI's lines, in which results are written."""
+    """The entries of `objects` as lines in KITTI's format, in which results are written."""
     return _lines(path, rig_path, read_frame(path).objects, True)
 
 
 def labels_of(path: Path, rig_path: Path) -> list[KittiObject] | None:
-    """Those of `labels`, or None."""
+    """The entries of `labels` as lines in KITTI's format, or None."""
     labels = read_frame(path).labels
     return None if labels is None else _lines(path, rig_path, labels, False)
 
 
 def plane_of(path: Path, needed: bool) -> NDArray[np.float64] | None:
-    """The ground plane (a, b, c, d) with its normal up; None where there is none and none is needed."""
+    """The ground plane (a, b, c, d) with its normal up, or None if there is none and none is needed."""
     plane = read_frame(path).ground_plane
     if plane is None and needed:
         raise DataFormatError(path, "holds no 'ground_plane'", cure="add it, or use --ground auto")
@@ -168,7 +168,7 @@ def plane_of(path: Path, needed: bool) -> NDArray[np.float64] | None:
 
 
 def motion_of(path: Path) -> tuple[float | None, NDArray[np.float64] | None]:
-    """Time and pose (4, 4) of the left camera, None where they are not given."""
+    """Time and pose (4, 4) of the left camera; each is None if it is not given."""
     frame = read_frame(path)
     if frame.T_world_cam is None:
         return frame.time_s, None
@@ -188,7 +188,7 @@ def _lines(path: Path, rig_path: Path, entries: Sequence[FolderObject], with_sco
 
 
 def _columns(rig_path: Path, entry: FolderObject) -> str:
-    """Observation angle, 2D box and 3D box of a line."""
+    """Observation angle, 2D box and 3D box as columns of a KITTI line."""
     if entry.dimensions_hwl_m is None or entry.bottom_center_m is None or entry.rotation_y_rad is None:
         return f"-10 {_words(entry.box_2d or (0.0, 0.0, 0.0, 0.0))} {_NO_BOX_3D}"
     hwl, (x, y, z), yaw = entry.dimensions_hwl_m, entry.bottom_center_m, entry.rotation_y_rad
@@ -208,7 +208,7 @@ def _projected(rig_path: Path, hwl: _Triple, bottom: _Triple, yaw: float) -> tup
 
 
 def masks_of(path: Path, root: Path, size_hw: tuple[int, int]) -> list[InstanceMask]:
-    """The masks of a frame: paths of 8-bit PNG files from `root`, or COCO segmentations."""
+    """The masks of a frame from 8-bit PNG files with paths relative to `root`, or from COCO segmentations."""
     return within_memory(path, _each_mask(path, root, size_hw))
 
 

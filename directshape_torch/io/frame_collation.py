@@ -1,4 +1,4 @@
-"""Several loaded frames as one batch, padded at the right and bottom to one size."""
+"""This module joins loaded frames into one batch, with images padded at the right and bottom to one size."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def collate(loaded: Sequence[LoadedFrame]) -> tuple[FrameBatch, Detections]:
 
 
 def split_by_rig(loaded: Sequence[LoadedFrame]) -> list[list[int]]:
-    """Numbers of the frames that `collate` takes together: those with the same residual disparity field."""
+    """Indices of frames in groups that `collate` accepts, which have the same residual disparity field."""
     parts: list[list[int]] = []
     for number, item in enumerate(loaded):
         field = item.frame.camera.disparity_field
@@ -71,7 +71,7 @@ def _same_field(a: DisparityField | None, b: DisparityField | None) -> bool:
 
 
 def _alike(frames: Sequence[FrameBatch], size_hw: Size) -> list[FrameBatch]:
-    """Padded to one size, with the optional tensors that all of them have."""
+    """Frames padded to one size, with only the optional tensors that all of them have."""
     known = {}
     for name in ("disparity", "points_cam", "time_s", "T_world_cam"):
         count = sum(getattr(frame, name) is not None for frame in frames)
@@ -82,7 +82,7 @@ def _alike(frames: Sequence[FrameBatch], size_hw: Size) -> list[FrameBatch]:
     alike = []
     for frame in frames:
         optional = {name: getattr(frame, name) for name, of_all in known.items() if of_all}
-        if known["disparity"]:  # zero is no disparity, like NaN
+        if known["disparity"]:  # zero means no disparity, as NaN does
             optional["disparity"] = _padded(optional["disparity"], size_hw)
         if known["points_cam"]:
             points = optional["points_cam"]
@@ -95,7 +95,7 @@ def _alike(frames: Sequence[FrameBatch], size_hw: Size) -> list[FrameBatch]:
 
 
 def _filled(d: Detections, known: set[str], size_hw: Size) -> Detections:
-    """Padded, with occluders, and with what other frames have for what is not known."""
+    """Detections with padded masks, with occluders, and with neutral values for tensors that only other frames have."""
     nothing: dict[str, Any] = {
         "pose_sigma": d.T_cam_obj.new_full((len(d), 4), torch.inf),
         "offset_sigma_px": torch.zeros_like(d.T_cam_obj[:, 0, 0]),
@@ -115,7 +115,7 @@ def _filled(d: Detections, known: set[str], size_hw: Size) -> Detections:
 
 
 def _numbered(d: Detections, number: int, sequence: int, num_sequences: int) -> Detections:
-    """Of the frame of that number; no track of a sequence is that of another."""
+    """Detections with the index of their frame; track numbers of different sequences become distinct."""
     tracks, hidden = d.track_id, d.occluders
     if tracks is not None and num_sequences > 1:
         tracks = torch.where(tracks < 0, tracks, tracks * num_sequences + sequence)
@@ -125,6 +125,6 @@ def _numbered(d: Detections, number: int, sequence: int, num_sequences: int) -> 
 
 
 def _padded(images: Tensor, size_hw: Size) -> Tensor:
-    """Padding by nothing copies too: frames of one size are copied once, into the batch."""
+    """Images padded to a size; images that have it are returned without a copy."""
     extra = (0, size_hw[1] - images.shape[-1], 0, size_hw[0] - images.shape[-2])
     return pad(images, extra) if any(extra) else images

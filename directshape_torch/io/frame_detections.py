@@ -1,4 +1,4 @@
-"""From the lines of a detection file and the masks of a frame to `Detections`."""
+"""This module makes `Detections` from the lines of a detection file and the masks of a frame."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from directshape_torch.scene import SIDES, Detections, Occluders
 
 @dataclass(frozen=True)
 class FrameDetections:
-    """The B detections of a frame, and what connects them with its files."""
+    """A `FrameDetections` has the B detections of a frame and their relation to the files."""
 
     detections: Detections
     rows: tuple[int, ...]  # for each input line the index of its detection, or -1
-    tracks: tuple[int, ...]  # (B,) of the left masks, -1 for none
+    tracks: tuple[int, ...]  # (B,) track numbers from the left masks, -1 for none
     no_mask_reasons: tuple[str, ...]  # (B,) why a detection has no left mask, else ""
 
 
@@ -35,7 +35,7 @@ def build_detections(
 ) -> FrameDetections:
     """The objects to refine, with masks matched one to one; all other instances become occluders.
 
-    The depth of an occluder is known where it is the mask of an object of another class (a van, a pedestrian).
+    The depth of an occluder is known if it is the mask of an object of another class (a van, a pedestrian).
     """
     boxes = [o for o in objects if o.has_box_3d]
     is_chosen = [o.has_box_3d and o.type in classes for o in objects]
@@ -85,7 +85,7 @@ def _occluders(
     size_hw: tuple[int, int],
     dtype: torch.dtype,
 ) -> Occluders:
-    """Every instance that is no detection's, one entry each, with the other image's mask empty.
+    """Occluders for all instances that belong to no detection, each with an empty mask in the other image.
 
     The two images are rectified, so the lower edge of a mask has the same row in both.
     """
@@ -103,7 +103,7 @@ def _occluders(
 
 
 def _crops(masks: Sequence[InstanceMask | None], size_hw: tuple[int, int], dtype: torch.dtype) -> MaskCrops:
-    """Foreground probabilities, empty without a mask."""
+    """Crops of the foreground probabilities, which are empty for an object without a mask."""
     empty = (0, 0, 0, 0), torch.zeros(0, 0)
     crops = [empty if mask is None else (mask.crop_box, torch.from_numpy(mask.probability)) for mask in masks]
     return MaskCrops.of_boxes(crops, size_hw, torch.zeros(0, dtype=dtype))

@@ -1,4 +1,4 @@
-"""Where the parts of a frame are, all in which the layouts of stereo data sets differ, and what these files say."""
+"""This module locates and reads the files of a frame in every layout, and finds frames by their names."""
 
 from __future__ import annotations
 
@@ -22,47 +22,49 @@ from directshape_torch.io.motion_files import of_line, read_poses, read_times
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """The files of one frame; all but the images are KITTI's, or where they end in .json those of the plain folder,
-    whose file of detections holds plane, labels, time and camera pose too.
+    """A `FrameFiles` has the paths of the files of one frame.
+
+    Files other than images have KITTI's formats. Files that end in .json have the format of the plain folder, whose
+    detection file also contains plane, labels, time and camera pose.
     """
 
     left: Path
     right: Path
     calibration: Path
     detections: Path
-    # What a frame may be called in a folder that somebody names: "000012", of several sequences "0005/000012" or
+    # Possible names of the frame in a folder that a user names: "000012", or with several sequences "0005/000012" or
     # "0005_000012".
     names: tuple[str, ...]
-    plane: Path  # where it would be
+    plane: Path  # the path may not exist
     labels: Path | None = None
-    velo_to_cam: Path | None = None  # places the LiDAR; None: the calibration does
-    # Times and camera poses of a sequence, a line each from frame 0 on.
+    velo_to_cam: Path | None = None  # file that gives the pose of the LiDAR; None if the calibration does
+    # Times and camera poses of a sequence, one line for each frame from frame 0 on.
     times: Path | None = None
     trajectory: Path | None = None
 
     @property
     def stems(self) -> tuple[str, ...]:
-        """`names` without folders."""
+        """The `names` without folders."""
         return tuple(Path(name).name for name in self.names)
 
     def read_calibration(self) -> KittiCalibration:
-        """The rig."""
+        """The calibration of the rig."""
         is_folder = _is_json(self.calibration)
         return folder_files.calibration_of(self.calibration) if is_folder else read_calibration(self.calibration)
 
     def read_lidar_calibration(self) -> KittiCalibration:
-        """The rig with the place of the LiDAR, where its format can say that."""
+        """The calibration of the rig with the pose of the LiDAR, if the format has it."""
         calibration, place = self.read_calibration(), self.velo_to_cam
         return calibration if place is None else replace(calibration, Tr_velo_to_cam=read_velo_to_cam(place))
 
     def read_objects(self) -> list[KittiObject]:
-        """The detections."""
+        """The lines of the detection file."""
         if _is_json(self.detections):
             return folder_files.detections_of(self.detections, self.calibration)
         return objects_in(self.detections, *self.stems)
 
     def read_labels(self) -> list[KittiObject] | None:
-        """The ground truth, or None."""
+        """The lines of the ground truth, or None."""
         if _is_json(self.detections):
             return folder_files.labels_of(self.detections, self.calibration)
         if self.labels is None:
@@ -71,14 +73,13 @@ class FrameFiles:
         return read_objects(self.labels, is_label=True) if of_frame else objects_in(self.labels, *self.stems)
 
     def read_plane(self, needed: bool = False) -> NDArray[np.float64] | None:
-        """The ground plane (a, b, c, d), see `kitti_calibration.read_plane`; None where there is none and none is
-        needed."""
+        """The ground plane (a, b, c, d), see `kitti_calibration.read_plane`, or None if absent and not needed."""
         if _is_json(self.detections):
             return folder_files.plane_of(self.detections, needed)
         return read_plane(self.plane) if needed or self.plane.is_file() else None
 
     def read_motion(self) -> tuple[float | None, NDArray[np.float64] | None]:
-        """When the frame was taken, seconds, and T_world_ref (4, 4); None where that is not known."""
+        """Time of the frame in seconds and T_world_ref (4, 4); each is None if it is not known."""
         if _is_json(self.detections):
             return folder_files.motion_of(self.detections)
         said = [
@@ -88,19 +89,19 @@ class FrameFiles:
         return None if said[0] is None else float(said[0]), said[1]
 
     def within(self, folder: Path, *endings: str) -> Path:
-        """The file of the frame in a folder, or in a folder `data` there, else where it would be.
+        """The file of the frame in `folder` or `folder/data`, or the path where it is expected.
 
-        Endings such as ".png", the most wanted first.
+        Endings such as ".png" come in the order of preference.
         """
         return first_existing([*candidates(folder, self.names, endings), folder / f"{self.names[0]}{endings[-1]}"])
 
 
 class FrameLayout(Protocol):
-    """A data set, by the files of its frames."""
+    """A `FrameLayout` is a data set that is described by the files of its frames."""
 
-    detections_dir: Path  # where they are looked for
+    detections_dir: Path  # folder of the detections
     detection_file_name: str  # for messages, such as "NNNNNN.txt"
-    sequence: str  # name of the only sequence; "" for several, and where they have no names
+    sequence: str  # name of the only sequence; "" for several sequences or sequences without names
 
     def frame_ids(self) -> list[str]:
         """All frames that have detections, sorted."""
@@ -109,30 +110,31 @@ class FrameLayout(Protocol):
         """The files of a frame."""
 
     def sequence_of(self, frame_id: str) -> str | None:
-        """The sequence of frames that follow each other, "" where there is but one; None: a frame by itself.
+        """The sequence of consecutive frames, "" if there is only one, or None for a frame without neighbours.
 
-        Asked of every frame of a data set, so without a look at the disk.
+        It is called for every frame of a data set, so it does not access the disk.
         """
 
 
 def candidates(folder: Path, names: Sequence[str], endings: Sequence[str]) -> list[Path]:
-    """Where the file of a frame of several names may be."""
+    """Paths where the file of a frame with these names may be."""
     files = [folder / f"{name}{ending}" for name in names for ending in endings]
     return [place for file in files for place in (file.parent / "data" / file.name, file)]
 
 
 def first_existing(paths: Sequence[Path]) -> Path:
-    """The first file that exists, else the last of all."""
+    """The first file that exists, else the last path."""
     return next((path for path in map(found, paths) if path is not None), paths[-1])
 
 
 def frames_among(known: Sequence[str], wanted: Iterable[str | int], expected: str) -> list[str]:
-    """Those of the known frames that are meant by ids, or by numbers with leading zeros or without, each once.
+    """The known frames with the given ids or numbers (leading zeros are optional), each once.
 
-    A number may leave out what all of them end in: 7 is `000007_10`, the first pair of a scene of KITTI Stereo 2015.
+    A number may omit an ending that all frames share: 7 is `000007_10`, the first pair of a scene of KITTI Stereo 2015.
 
     Raises:
-        InputError: unknown ones, in the words for what was expected; or one alone, for a word is also its letters.
+        InputError: a frame is unknown, which the error says in the words of `expected`; or `wanted` is one word or
+            number.
 
     Examples:
         >>> frames_among(["000007", "000012"], [12, "7"], "frames of a run")
@@ -153,14 +155,15 @@ def frames_of_split(
 ) -> list[str]:
     """The frames that the lines of a file name, each once.
 
-    A line is an id, a number with leading zeros or without, a path that ends in an id (`image_2/000107.png`), or folder
+    A line is an id, a number with or without leading zeros, a path that ends in an id (`image_2/000107.png`), or folder
     and number of a drive as in lists for KITTI's raw data (`2011_09_26/2011_09_26_drive_0005_sync 0000000005 l`).
 
     Args:
-        path: the file.
+        path: the file of the split.
         known: frames with detections.
-        exists: whether there is a frame of a name; one without detections is reported when its turn comes.
-        sequence: the one that the frames are of, whose name the first of two words must be; "" where it is not known.
+        exists: whether a frame with a name exists; a frame without detections is reported when it is loaded.
+        sequence: name of the sequence of the frames, which must be the first word of a line with two words; "" if it is
+            not known.
 
     Raises:
         DataFormatError: a line names no frame.
@@ -182,7 +185,7 @@ def frames_of_split(
 
 
 def _frame_word(folder: str, other: str, sequence: str | None, found: Mapping[str, str]) -> str:
-    """Which of the first two words of a line names a frame of the sequence, or "" where they are of another one."""
+    """The first or second word of a line, if it names a frame of the sequence, or "" for another sequence."""
     is_frame, other_is_frame = (
         bool({_key(word), _key(_without_ending(word))} & found.keys()) for word in (folder, other)
     )
@@ -192,7 +195,7 @@ def _frame_word(folder: str, other: str, sequence: str | None, found: Mapping[st
 
 
 def _by_name(known: Sequence[str]) -> dict[str, str]:
-    """Frames by their ids, which come first, and by their numbers."""
+    """Frames by their ids and by their numbers; ids take precedence."""
     of_number = {_key(name.removesuffix("_10")): name for name in reversed(known)}
     return of_number | {name: name for name in known}
 
@@ -204,12 +207,12 @@ def _without_ending(word: str) -> str:
 
 
 def _key(word: str) -> str:
-    """A number without leading zeros; another name in one spelling."""
+    """A number without leading zeros, or another name in one spelling of its accents."""
     return word.lstrip("0") or "0" if word.isdecimal() else composed(word)
 
 
 def existing_folder(path: Path, problem: str, cure: str = "check the path") -> Path:
-    """The path itself."""
+    """Return the path if it is a folder, else raise `DataFormatError`."""
     if not path.is_dir():
         raise DataFormatError(path, problem, cure=cure)
     return path

@@ -1,4 +1,4 @@
-"""Read images and refuse damaged ones, which OpenCV may decode in part with no more than a warning."""
+"""This module reads images and refuses damaged ones, which OpenCV may decode in part with only a warning."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_SIGNATURE = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
 _PNG_HEADER_BYTES = 33
-# Start of frame, all but the tables that have numbers between them.
+# These are the markers of a start of frame; the excluded markers among them are tables.
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_WITHOUT_LENGTH = frozenset((0x01, *range(0xD0, 0xD8)))
-# Eight times an 8-megapixel camera's.
+# This is eight times the size of an 8-megapixel image.
 _MOST_PIXELS = 2**26
 _CURE = "copy or download the file again"
-# Of a pixel of disparity, in the maps of KITTI's benchmarks.
+# The maps of KITTI's benchmarks store disparities in these units.
 _UNITS_PER_PIXEL = 256
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg")
 
@@ -37,7 +37,7 @@ def read_rgb(path: Path | str) -> NDArray[np.uint8]:
 
 
 def read_colours(path: Path | str) -> NDArray[Any]:
-    """Read a PNG or JPEG file as RGB, uint8 or uint16 (H, W, 3), as it is stored."""
+    """Read a PNG or JPEG file as RGB, uint8 or uint16 (H, W, 3), with the stored values."""
     import cv2
 
     bgr = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
@@ -45,12 +45,12 @@ def read_colours(path: Path | str) -> NDArray[Any]:
 
 
 def read_pair(left_path: Path, right_path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Both images of a rectified pair as RGB, uint8 (H, W, 3), see `as_pair`."""
+    """Read both images of a rectified pair as RGB, uint8 (H, W, 3), see `as_pair`."""
     return as_pair(read_colours(left_path), read_colours(right_path), right_path)
 
 
 def _in_bytes(images: Sequence[NDArray[Any]]) -> list[NDArray[np.uint8]]:
-    """Images in 8 bits; those of 16 are scaled alike, by the bits that they use: cameras have 10, 12 and 14, too."""
+    """Images in 8 bits; 16-bit images share one scale for the bits in use (cameras have 10, 12 and 14, too)."""
     if all(image.dtype == np.uint8 for image in images):
         return list(images)
     highest = max(int(image.max()) for image in images if image.dtype != np.uint8)
@@ -63,9 +63,10 @@ def _in_bytes(images: Sequence[NDArray[Any]]) -> list[NDArray[np.uint8]]:
 
 
 def as_pair(left: NDArray[Any], right: NDArray[Any], right_path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Both images as uint8, unless they differ in size.
+    """Both images as uint8; a `DataFormatError` is raised if they differ in size.
 
-    Images of 16 bits may hold fewer: numbers below 4096 are those of a camera of 12 bits. Both sides are scaled alike.
+    Images of 16 bits may use fewer bits: if all numbers are below 4096, the camera has 12 bits. Both sides are scaled
+    alike.
     """
     if left.shape != right.shape:
         raise DataFormatError(
@@ -78,7 +79,7 @@ def as_pair(left: NDArray[Any], right: NDArray[Any], right_path: Path) -> tuple[
 
 
 def read_single_channel(path: Path | str) -> NDArray[Any]:
-    """Read a one-channel PNG as it is stored, uint8 or uint16 (H, W)."""
+    """Read a one-channel PNG with the stored values, uint8 or uint16 (H, W)."""
     import cv2
 
     image = _decode(path, cv2.IMREAD_UNCHANGED)
@@ -91,7 +92,7 @@ def read_disparity(
     path: Path | str,
     size_hw: tuple[int, int] | None = None,
 ) -> NDArray[np.float32]:  # (H, W)
-    """Read `u_left - u_right` of each left pixel, pixels, from 16-bit PNG of disparity x 256; NaN where unknown (0)."""
+    """Read `u_left - u_right` (H, W), pixels, from 16-bit PNG of disparity x 256; 0 (unknown) becomes NaN."""
     stored = read_single_channel(path)
     if stored.dtype != np.uint16:
         raise DataFormatError(
@@ -110,7 +111,7 @@ def read_disparity(
 
 
 def find_image(folder: Path, stem: str) -> Path:
-    """The image `stem` with one of the endings png, jpg, jpeg in `folder`; the png path if there is none."""
+    """The image `stem` with one of the endings png, jpg, jpeg in `folder`, or the png path if there is none."""
     candidates = [folder / f"{stem}{ending}" for ending in IMAGE_ENDINGS]
     return next((path for path in map(found, candidates) if path is not None), candidates[0])
 
@@ -141,7 +142,7 @@ def _check_complete(path: Path | str, content: bytes) -> None:
 
 
 def _check_png(path: Path | str, content: bytes) -> None:
-    """Walk the chunks: each is length, type, data and checksum; the first one states the size, the last one is IEND."""
+    """Check every chunk (length, type, data, checksum), from the first with the image size to the last, IEND."""
     if content[12:16] == b"IHDR" and len(content) >= _PNG_HEADER_BYTES:
         _check_pixels(path, *struct.unpack_from(">II", content, 16))
     position = len(_PNG_SIGNATURE)
@@ -161,7 +162,7 @@ def _check_png(path: Path | str, content: bytes) -> None:
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int]:
-    """Width and height from the first frame header; (0, 0) where there is none."""
+    """Width and height from the first frame header, or (0, 0) if there is none."""
     position = len(_JPEG_SIGNATURE)
     while position + 9 <= len(content) and content[position] == 0xFF:
         marker = content[position + 1]
@@ -176,6 +177,6 @@ def _jpeg_size(content: bytes) -> tuple[int, int]:
 
 
 def _check_pixels(path: Path | str, width: int, height: int) -> None:
-    """Before anything is allocated for them."""
+    """Refuse an image of more pixels than allowed, before memory is allocated for it."""
     if not 0 < width * height <= _MOST_PIXELS:
         raise DataFormatError(path, f"states {width} x {height} pixels, expected 1 to {_MOST_PIXELS}", cure=_CURE)

@@ -1,4 +1,4 @@
-"""Instances of one image and their masks, as files encode them: soft PNG, COCO's run lengths and polygons."""
+"""This module holds instances of one image with their masks and decodes soft PNG, COCO run lengths and polygons."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.scene import Side
 
 Box = tuple[float, float, float, float]
-"""(u_min, v_min, u_max, v_max), pixels."""
+"""This is (u_min, v_min, u_max, v_max), pixels."""
 
-# The parts of all masks of a frame together: four bytes each where they are soft.
+# The crops of all masks of a frame together may have this many pixels; soft masks need four bytes for each.
 _MOST_PIXELS = 2**28
-# More than any outline has; rasterising takes memory for each pixel of it, wherever it lies.
+# No real outline is longer. Rasterising needs memory for each pixel of an outline, also outside the image.
 _LONGEST_OUTLINE_PX = 1e6
-# Five bits each, of runs that fit into 32.
+# A run fits into 32 bits, which come in groups of five.
 _MOST_GROUPS = 7
 
 
@@ -34,24 +34,24 @@ class MaskSizeError(DataFormatError):
 
 @dataclass(frozen=True)
 class InstanceMask:
-    """One instance in one image, by the part of the image where it is."""
+    """An `InstanceMask` is one instance in one image, given by the part of the image that contains it."""
 
     side: Side  # the image, "left" or "right"
     instance_id: int  # its number in the file; numbers of the two images need not agree
     is_car: bool  # whether it may be matched to a car
     corner: tuple[int, int]  # u and v of the upper left pixel of the part
     probability: NDArray[np.bool_] | NDArray[np.float32]  # (h, w), bool or float32 foreground probability in [0, 1]
-    score: float = 1.0  # the segmentation's, in [0, 1]
-    # Number of the car over the frames of its sequence, -1 where `instance_id` is of one frame alone.
+    score: float = 1.0  # confidence of the segmentation, in [0, 1]
+    # Number of the car in all frames of its sequence; -1 if `instance_id` is valid for one frame only.
     track_id: int = -1
-    # The detection that the file gives it to, counted from 0; None: found by overlap.
+    # The index of the detection that the file names for it, from 0; None if the mask is matched by overlap.
     row: int | None = None
 
     @classmethod
     def found(
         cls, side: Side, instance_id: int, is_car: bool, probability: NDArray[Any], **known: Any
     ) -> InstanceMask | None:
-        """The instance of a mask (H, W) of a whole image; None where no pixel is above one half.
+        """The instance of a mask (H, W) of a whole image, or None if no pixel is above one half.
 
         Examples:
             >>> mask = np.zeros((100, 200), bool)
@@ -67,19 +67,19 @@ class InstanceMask:
 
     @cached_property
     def inside(self) -> NDArray[np.bool_]:
-        """(h, w) the pixels of the part that are above one half."""
+        """Pixels (h, w) of the part that are above one half."""
         return np.asarray(self.probability > MASK_THRESHOLD)
 
     @cached_property
     def mask_box(self) -> Box:
-        """The smallest box around the pixels above one half, both ends belonging to it."""
+        """The smallest box around the pixels above one half, with both ends included."""
         rows, columns = (np.flatnonzero(self.inside.any(axis=axis)) for axis in (1, 0))
         u, v = self.corner
         return float(u + columns[0]), float(v + rows[0]), float(u + columns[-1]), float(v + rows[-1])
 
     @property
     def crop_box(self) -> tuple[int, int, int, int]:
-        """u0, v0, u1, v1 of the part, half open."""
+        """The part as u0, v0, u1, v1, where u1 and v1 are excluded."""
         (u, v), (height, width) = self.corner, self.probability.shape
         return u, v, u + width, v + height
 
@@ -91,32 +91,33 @@ class InstanceMask:
 
 
 class MaskSource(Protocol):
-    """Where the masks of a frame come from."""
+    """A `MaskSource` provides the masks of frames."""
 
     def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
         """Masks of both images of a frame whose images have `size_hw` pixels."""
 
     def files(self, frame_id: str) -> tuple[Path, ...]:
-        """The files that `read` opens for a frame, so that a run can tell when they change."""
+        """The files that `read` opens for a frame, so that a run can detect changes."""
 
 
 def file_of_frame(directory: Path, name: str) -> Path:
-    """`directory/name`, or `directory/data/name` where that exists."""
+    """`directory/data/name` or `directory/name`, whichever exists, else the latter."""
     return found(directory / "data" / name) or found(directory / name) or directory / name
 
 
 def read_mask(path: Path, where: str, mask: Any, size_hw: tuple[int, int], root: Path) -> NDArray[Any]:
-    """A mask (H, W) as a file says it, bool or foreground probability in [0, 1].
+    """A mask (H, W) from its entry in a file, as bool or foreground probability in [0, 1].
 
     Args:
         path, where: the file and the place in it, named in errors.
-        mask: the path, from `root`, of a PNG of probability x 255 (or x 65535, with 16 bits), or a COCO segmentation.
+        mask: the path, relative to `root`, of a PNG of probability x 255 (or x 65535 with 16 bits), or a COCO
+            segmentation.
         size_hw: size of the image.
-        root: a folder.
+        root: folder of the PNG files.
 
     Raises:
-        DataFormatError: the PNG is missing, damaged, or has several channels; or as `decode_segmentation`.
-        MaskSizeError: it has another size than its image.
+        DataFormatError: the PNG is missing, damaged, or has several channels, or `decode_segmentation` raises.
+        MaskSizeError: the mask has another size than its image.
     """
     if not isinstance(mask, str):
         return decode_segmentation(path, where, mask, size_hw)
@@ -126,7 +127,7 @@ def read_mask(path: Path, where: str, mask: Any, size_hw: tuple[int, int], root:
 
 
 def within_memory(path: Path, masks: Iterable[InstanceMask | None]) -> list[InstanceMask]:
-    """The masks of a frame, as they are made; raises `DataFormatError` where they would not fit into memory."""
+    """The masks of a frame; a `DataFormatError` is raised if they would not fit into memory."""
     kept, pixels = list[InstanceMask](), 0
     for mask in masks:
         if mask is not None:
@@ -154,13 +155,14 @@ def decode_segmentation(path: Path, where: str, segmentation: Any, size_hw: tupl
 
     Args:
         path, where: the file and the entry's place in it, named in errors.
-        segmentation: RLE `{"size": [H, W], "counts": str | bytes | list}`, or polygons `[x0, y0, x1, y1, ..]`, of which
-            those without an area (less than three points) and None show nothing.
+        segmentation: RLE `{"size": [H, W], "counts": str | bytes | list}`, or a list of polygons `[x0, y0, x1, y1,
+            ..]`. Polygons without an area (fewer than three points) and None cover no pixels.
         size_hw: size of the image.
 
     Raises:
-        MaskSizeError: run lengths of another size than the image.
-        DataFormatError: neither form, runs that do not add up to the size, or polygons far beyond the image.
+        MaskSizeError: run lengths are of another size than the image.
+        DataFormatError: the segmentation has neither form, runs do not add up to the size, or polygons lie far outside
+            the image.
 
     Examples:
         >>> rle = {"size": [2, 3], "counts": [2, 3, 1]}  # down the columns: 2 off, 3 on, 1 off
@@ -174,7 +176,7 @@ def decode_segmentation(path: Path, where: str, segmentation: Any, size_hw: tupl
         check_size(path, f"{where}: the mask", size, size_hw)
         return _from_runs(path, where, segmentation["counts"], size_hw)
     if segmentation is None or (isinstance(segmentation, list) and all(map(_is_polygon, segmentation))):
-        # Tools write down outlines of one or two points, and nothing at all, for what has no area.
+        # Tools write outlines of one or two points, or nothing, for instances without an area.
         with_area = [polygon for polygon in segmentation or [] if len(polygon) >= 6 and len(polygon) % 2 == 0]
         if not with_area:
             return np.zeros(size_hw, dtype=bool)
@@ -203,7 +205,7 @@ def _from_runs(path: Path, where: str, counts: Any, size_hw: tuple[int, int]) ->
 
 
 def _runs(counts: Any) -> Sequence[int]:
-    """Run lengths as numbers of at least 0; `ValueError` where they are something else."""
+    """Run lengths as numbers of at least 0; `ValueError` is raised for anything else."""
     if isinstance(counts, (str, bytes)):
         runs = _run_lengths(_unprinted(counts).encode("ascii") if isinstance(counts, str) else counts)
     elif isinstance(counts, list) and all(_is_number(run) and float(run).is_integer() for run in counts):
@@ -216,19 +218,19 @@ def _runs(counts: Any) -> Sequence[int]:
 
 
 def _unprinted(counts: str) -> str:
-    """The text itself; of bytes that were printed into a text what they hold: the encoding has no quotation marks."""
+    """Counts without the `b'..'` around printed bytes; the encoding itself has no quotation marks."""
     is_printed = counts.startswith(("b'", 'b"')) and counts.endswith(("'", '"'))
     return counts[2:-1].replace("\\\\", "\\") if is_printed else counts
 
 
 def _outlined(path: Path, where: str, polygons: Sequence[Sequence[float]], size_hw: tuple[int, int]) -> bytes:
-    """The run lengths of what polygons cover."""
+    """The run lengths of the pixels that polygons cover."""
     import pycocotools.mask
 
     for polygon in polygons:
         corners = np.array(polygon, dtype=np.float64).reshape(-1, 2)
         outline_px = np.abs(np.diff(corners, axis=0, append=corners[:1])).sum()
-        # `not <=`, so that NaN is refused too.
+        # `not <=` refuses NaN too.
         if not max(outline_px, np.abs(corners).max()) <= _LONGEST_OUTLINE_PX:
             raise DataFormatError(
                 path,

@@ -1,4 +1,4 @@
-"""KITTI calibration files of all layouts, the stereo camera they describe, and AVOD's files of the ground plane."""
+"""This module reads KITTI calibration files of all layouts, their stereo camera, and AVOD's ground plane files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
 
 _PLANE_CURE = "write four lines: '# Plane', 'Width 4', 'Height 1', then a b c d with a x + b y + c z + d = 0"
-# The name of each matrix in the object, the tracking, the raw and the odometry layout, and its shape.
+# The names of each matrix in the object, the tracking, the raw and the odometry layout, and its shape.
 _CAMERAS: dict[str, tuple[str, tuple[int, int]]] = {
     "P2": ("P2", (3, 4)),
     "P_rect_02": ("P2", (3, 4)),
@@ -36,7 +36,7 @@ _LIDAR = {"R": ("R", (3, 3)), "T": ("T", (3, 1))}
 
 @dataclass(frozen=True)
 class KittiCalibration:
-    """Matrices of one calibration file, float64."""
+    """A `KittiCalibration` has the matrices of one calibration file, float64."""
 
     path: Path  # the file
     # Projections of the left and the right colour camera from the `ref` frame, (3, 4), pixels.
@@ -44,11 +44,11 @@ class KittiCalibration:
     P3: NDArray[np.float64]
     R0_rect: NDArray[np.float64] | None = None  # camera 0 to rectified camera 0, (3, 3), or None
     Tr_velo_to_cam: NDArray[np.float64] | None = None  # LiDAR to camera 0, (3, 4), metres, or None
-    size_wh: tuple[int, int] | None = None  # of the images, where the file says
-    names: tuple[str, str] = ("P2", "P3")  # of what the file says of the left and of the right camera
+    size_wh: tuple[int, int] | None = None  # size of the images, if the file has it
+    names: tuple[str, str] = ("P2", "P3")  # names of the left and the right projection in the file
 
     def of_size(self, size_wh: tuple[int, int]) -> Self:
-        """The calibration itself; raises `DataFormatError` where the file says that images are of another size."""
+        """Return the calibration; a `DataFormatError` is raised if the file gives another image size."""
         if self.size_wh not in (None, size_wh):
             said, got = (" x ".join(map(str, size)) for size in (self.size_wh or (), size_wh))
             problem = f"is of images of {said} pixels, they have {got}"
@@ -59,14 +59,14 @@ class KittiCalibration:
 def read_calibration(path: Path | str) -> KittiCalibration:
     """Read a KITTI calibration file.
 
-    It is `calib/NNNNNN.txt` of the object benchmark, `calib.txt` of a tracking or an odometry sequence, or
+    The file is `calib/NNNNNN.txt` of the object benchmark, `calib.txt` of a tracking or an odometry sequence, or
     `calib_cam_to_cam.txt` of a raw drive.
     """
     cure = "a stereo pair needs the projections P2 and P3 (of raw drives P_rect_02 and P_rect_03)"
     found, called = _read_matrices(path, _CAMERAS, ("P2", "P3"), cure)
     velo_to_rect = found.pop("Tr_velo_to_rect", None)
     if velo_to_rect is not None:
-        # The odometry benchmark has its rotation to rectified images in it.
+        # The matrix of the odometry benchmark includes the rotation to rectified images.
         found = {"R0_rect": np.eye(3), "Tr_velo_to_cam": velo_to_rect} | found
     return KittiCalibration(Path(path), **found, names=(called["P2"], called["P3"]))
 
@@ -81,9 +81,9 @@ def read_velo_to_cam(path: Path | str) -> NDArray[np.float64]:
 def _read_matrices(
     path: Path | str, known: Mapping[str, tuple[str, tuple[int, int]]], needed: Sequence[str], cure: str
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """The matrices in lines of `name: numbers`, the colon being optional, and what each is called in the file.
+    """The matrices in lines of `name: numbers`, with optional colon, and their names in the file.
 
-    Further lines are passed over.
+    Other lines are ignored.
     """
     matrices, called = dict[str, Any](), dict[str, str]()
     for line in read_lines(path):
@@ -111,7 +111,7 @@ def to_stereo_camera(calibration: KittiCalibration) -> StereoCamera:
 
 
 def _no_rig(calibration: KittiCalibration, error: InputError) -> str:
-    """What is wrong with a rig, in the words of its file."""
+    """The error of a rig in terms of the names in its file."""
     left, right = calibration.names
     if error.name != "P_right":
         return f"{left} and {right} describe no stereo rig: {error}"
@@ -132,7 +132,7 @@ def camera_of_rig(
     size_wh: tuple[int, int],
     dtype: torch.dtype = torch.float32,
 ) -> StereoCamera:
-    """The stereo camera of a frame, with the first of some disparity fields that is of its rig, if there are any."""
+    """The stereo camera of a frame, with the first disparity field that fits its rig, if any are given."""
     rig = to_stereo_camera(calibration.of_size(size_wh))
     refusal: InputError | None = None
     for field in fields:
@@ -159,9 +159,9 @@ def read_plane(path: Path | str) -> NDArray[np.float64]:
 
 
 def upright_plane(path: Path | str, plane: NDArray[np.float64], line: Line | None = None) -> NDArray[np.float64]:
-    """A plane (a, b, c, d) normalised and with its normal up (b < 0)."""
+    """A plane (a, b, c, d), normalised and with its normal up (b < 0)."""
     length = float(np.linalg.norm(plane[:3]))
-    # A ground that leans by more than 60 degrees is a mistake in the order or the frame of the coefficients.
+    # A ground with a slope of more than 60 degrees means that the order or the frame of the coefficients is wrong.
     if not abs(plane[1]) > 0.5 * length:
         raise DataFormatError(
             path,

@@ -1,4 +1,4 @@
-"""Label and result files of KITTI's object benchmark (one a frame) and of its tracking benchmark (one a sequence)."""
+"""This module reads label and result files of KITTI's object benchmark (per frame) and tracking benchmark."""
 
 from __future__ import annotations
 
@@ -20,35 +20,35 @@ from directshape_torch.io.instance_masks import file_of_frame
 _COLUMNS = "type truncated occluded alpha u_min v_min u_max v_max h w l x y z rotation_y [score]"
 _CURE = f"write one object a line: {_COLUMNS}"
 _MOST_DIGITS = 9
-# KITTI writes these where a box has no 3D part (DontCare, 2D detectors).
+# KITTI writes this for a box without a 3D part (DontCare, 2D detectors).
 _NO_LOCATION_M = -1000.0
 
 
 @dataclass(frozen=True)
 class KittiObject:
-    """One line of a label file (15 columns) or a result file (16 columns, the score last)."""
+    """A `KittiObject` is one line of a label file (15 columns) or a result file (16 columns, the score last)."""
 
     type: str  # class name, such as "Car"
-    truncated: float  # share of the object outside the image, -1 where unknown
-    occluded: int  # 0 visible .. 3 unknown, -1 where not given.
+    truncated: float  # share of the object outside the image, -1 if unknown
+    occluded: int  # 0 visible .. 3 unknown, -1 if not given
     alpha: float  # observation angle, radians
     box_2d: tuple[float, float, float, float]  # (u_min, v_min, u_max, v_max) in the left image, pixels
     hwl: tuple[float, float, float]  # height, width, length, metres
     location_ref: tuple[float, float, float]  # bottom centre of the box in the `ref` frame, metres
     rotation_y: float  # heading about the y axis of `ref`, radians
-    score: float | None  # the detector's, or None in a label
-    raw_line: str  # the line as it is in the file, without its newline
+    score: float | None  # confidence of the detector, None in a label
+    raw_line: str  # the line of the file, without its newline
     line_number: int  # from 1
-    track_id: int = -1  # number of the car over the frames of its sequence, -1 where the file has none
+    track_id: int = -1  # number of the car in all frames of its sequence, -1 if the file has none
 
     @property
     def has_box_3d(self) -> bool:
-        """Whether the line carries a 3D box (positive dimensions and a place)."""
+        """Whether the line has a 3D box (positive dimensions and a position)."""
         return min(self.hwl) > 0 and self.location_ref[2] != _NO_LOCATION_M
 
 
 def read_objects(path: Path | str, is_label: bool = False) -> list[KittiObject]:
-    """Read a KITTI label file (15 columns a line), or unless `is_label` a result file too (16); both may be empty."""
+    """Read a KITTI label file (15 columns) or, unless `is_label`, also a result file (16); files may be empty."""
     return [parse_object(path, line, is_label) for line in read_lines(path)]
 
 
@@ -74,9 +74,10 @@ def parse_object(path: Path | str, line: Line, is_label: bool = False) -> KittiO
 
 
 def own_boxes_2d(objects: Sequence[KittiObject]) -> NDArray[np.float64]:  # (N, 4)
-    """The 2D boxes of objects, zeros for what is none.
+    """The 2D boxes of objects, with zeros for entries that are no real box.
 
-    That is -1, zeros, the same numbers for several objects, or a corner of the image: no car ends above it and beside.
+    Such entries are -1, zeros, the same numbers for several objects, or boxes that begin at or beyond the image's upper
+    left corner, which no car does.
     """
     boxes = np.array([o.box_2d for o in objects], dtype=np.float64).reshape(-1, 4)
     _, number_of, counts = np.unique(boxes, axis=0, return_inverse=True, return_counts=True)
@@ -88,7 +89,7 @@ def poses_cam(
     objects: Sequence[KittiObject],
     t_cam_ref: Tensor,  # (3,) metres
 ) -> Tensor:
-    """`T_cam_obj` (B, 4, 4) of the 3D boxes, with the dtype and device of `t_cam_ref`; float64 inside.
+    """`T_cam_obj` (B, 4, 4) of the 3D boxes, with the dtype and device of `t_cam_ref`, computed in float64.
 
     Examples:
         >>> line = Line(1, "Car 0 0 0 0 0 9 9 1.5 1.6 3.9 1 1.6 20 0", "")
@@ -118,9 +119,10 @@ def box_corners_cam(
 
 @remembered
 def read_tracking_objects(path: Path | str) -> dict[int, list[KittiObject]]:
-    """The objects of every frame number that occurs in a label (17 columns) or result file (18), with their tracks.
+    """The objects, with their tracks, of every frame number in a label (17 columns) or result file (18).
 
-    Their `raw_line` leaves frame and track out and their `line_number` counts within the frame, as in its own file.
+    Their `raw_line` has no columns of frame and track, and their `line_number` counts within the frame, as in a file of
+    one frame.
     """
     frames: dict[int, list[KittiObject]] = {}
     for line in read_lines(path):
@@ -139,7 +141,7 @@ def objects_path(source: Path, frame_id: str) -> Path:
     """The file of a frame `FRAME` or `SEQUENCE_NNNNNN`.
 
     `source` is the file of a sequence, or a folder of `FRAME.txt`, `SEQUENCE.txt` or `SEQUENCE/NNNNNN.txt`; the files
-    may lie in a folder `data` there. `FRAME` may leave out `_10`, the end of the first pair in KITTI Stereo 2015.
+    may lie in a subfolder `data`. `FRAME` may omit `_10`, the end of the first pair in KITTI Stereo 2015.
     """
     sequence, _, number = frame_id.rpartition("_")
     names = dict.fromkeys([frame_id, frame_id.removesuffix("_10"), *([sequence] if sequence else [])])
@@ -149,21 +151,21 @@ def objects_path(source: Path, frame_id: str) -> Path:
 
 
 def objects_in(path: Path, *names: str) -> list[KittiObject]:
-    """The objects of a frame in a file called as the frame, else in one of the tracking benchmark.
+    """The objects of a frame from a file with the frame's name, else from one of the tracking benchmark.
 
-    A file called by its number in the folder of its sequence is one of the frame.
+    A file with the number of a frame in the folder of its sequence is a file of one frame.
     """
     sequence, _, number = names[0].rpartition("_")
     folder = path.parent.parent if path.parent.name == "data" else path.parent
     is_in_sequence = bool(sequence) and folder.name == sequence and is_called(path, [number])
     if is_in_sequence or is_called(path, (*names, names[0].removesuffix("_10"))):
         return read_objects(path)
-    # A list of the caller's own, for that of the file is remembered.
+    # The caller gets a list of its own, because the list of the file is cached.
     return [*read_tracking_objects(path).get(frame_number(names[0]), [])]
 
 
 def frame_number(frame_id: str) -> int:
-    """The number of a frame in its sequence, of `NNNNNN` or `SEQUENCE_NNNNNN`.
+    """The number of a frame in its sequence, from `NNNNNN` or `SEQUENCE_NNNNNN`.
 
     Examples:
         >>> frame_number("0005_000012")

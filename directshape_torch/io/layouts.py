@@ -1,4 +1,4 @@
-"""The layouts of data sets: one reader, to which each of them is a table of file names."""
+"""This module has one reader for all layouts of data sets; a table of file names describes each layout."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from directshape_torch.io.image_files import find_image
 
 @dataclass(frozen=True)
 class Patterns:
-    """Where the files of a sequence are, below its folder.
+    """A `Patterns` has the paths of the files of a sequence, relative to its folder.
 
-    In names `{stem}` stands for the frame's name in its sequence, `{sequence}` for the name of that, and `{scene}` for
-    what comes before the "_" of a stem. All but images and calibration may be missing.
+    In names `{stem}` stands for the frame's name in its sequence, `{sequence}` for the name of the sequence, and
+    `{scene}` for the part of a stem before "_". All files except images and calibration are optional.
     """
 
     # Images, without ending.
@@ -25,14 +25,14 @@ class Patterns:
     right: str
     calibration: str  # file with P2 and P3, or P_rect_02 and P_rect_03; or `rig.json`
     plane: str = "planes/{stem}.txt"
-    labels: str = ""  # a file a frame, or without `{stem}` one of the tracking benchmark; "": there are none
-    velo_to_cam: str = ""  # file that places the LiDAR; "": the calibration does
-    # Times and camera poses of a sequence, a line each from frame 0 on; "": there are none.
+    labels: str = ""  # one file for each frame, or without `{stem}` one of the tracking benchmark; "" for none
+    velo_to_cam: str = ""  # file that gives the pose of the LiDAR; "" if the calibration does
+    # Times and camera poses of a sequence, one line for each frame from frame 0 on; "" for none.
     times: str = ""
     trajectory: str = ""
-    detections: str = "NNNNNN.txt"  # what their files are called
-    first: str = ""  # end of a name that files may leave out
-    follow_each_other: bool = True  # whether the frames do
+    detections: str = "NNNNNN.txt"  # names of the detection files, for messages
+    first: str = ""  # end of a name that files may omit
+    follow_each_other: bool = True  # whether the frames are consecutive
 
 
 OBJECT = Patterns(
@@ -46,7 +46,7 @@ STEREO_2015 = Patterns(
     first="_10",
     follow_each_other=False,
 )
-# Everything that is not in these files is in the one of the detections.
+# The detection files contain all parts of a frame that have no file of their own here.
 FOLDER = Patterns("left/{stem}", "right/{stem}", "rig.json", detections="ID.json")
 TRACKING_SEQUENCE = Patterns(
     "image_02/{stem}",
@@ -73,7 +73,7 @@ ODOMETRY = Patterns(
     times="sequences/{sequence}/times.txt",
     trajectory="poses/{sequence}.txt",
 )
-# In the folder of the day, and with a calibration in the drive itself.
+# The calibration is in the folder of the day, or in the drive itself.
 RAW_OF_DAY = Patterns(
     "{sequence}/image_02/data/{stem}",
     "{sequence}/image_03/data/{stem}",
@@ -92,14 +92,14 @@ RAW = replace(
 
 
 class Layout:
-    """One sequence, whose frames are called as their images are, or several, with `SEQUENCE_` before that.
+    """A `Layout` is one sequence, whose frames have the names of their images, or several with the prefix `SEQUENCE_`.
 
     Args:
-        sequences: for each its folder and the names in it; the single one of a benchmark without sequences is "".
-        detections_dir: holds `NNNNNN.txt` or `data/NNNNNN.txt` (one sequence), or for several `SEQUENCE/NNNNNN.txt`,
-            `SEQUENCE/data/NNNNNN.txt` or `data/SEQUENCE_NNNNNN.txt`; in either case also `SEQUENCE.txt`, a result or
-            label file of the tracking benchmark.
-        single: whether there is no prefix.
+        sequences: folder and file names of each sequence; the name is "" for a benchmark without sequences.
+        detections_dir: folder with `NNNNNN.txt` or `data/NNNNNN.txt` (one sequence), or for several
+            `SEQUENCE/NNNNNN.txt`, `SEQUENCE/data/NNNNNN.txt` or `data/SEQUENCE_NNNNNN.txt`. Both may also have
+            `SEQUENCE.txt`, a result or label file of the tracking benchmark.
+        single: whether frame names have no prefix.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Layout:
         self.detection_file_name = patterns.detections + ("" if "" in sequences else " or SEQUENCE.txt")
 
     def frame_ids(self) -> list[str]:
-        """The frames with a detection file, or all of the sequences that have one of the tracking benchmark."""
+        """The frames with a detection file, or all frames of a sequence that has one of the tracking benchmark."""
         stems = self._detection_stems(self.detections_dir)
         return [self._join(name, stem) for name in sorted(self._sequences) for stem in self._stems(name, stems)]
 
@@ -154,7 +154,7 @@ class Layout:
         return None if not follow_each_other else "" if self._single else name
 
     def _split(self, frame_id: str) -> tuple[str, str]:
-        """Names of a frame's sequence, and of the frame in it."""
+        """The name of a frame's sequence and the name of the frame in it."""
         if self._single:
             return next(iter(self._sequences)), frame_id
         name, _, stem = frame_id.rpartition("_")
@@ -163,7 +163,7 @@ class Layout:
         return name, stem
 
     def _stems(self, name: str, all_stems: list[str]) -> list[str]:
-        """The frames of a sequence that have detections, of which `all_stems` lie directly in their folder."""
+        """The frames of a sequence that have detections; `all_stems` are names directly in the detections folder."""
         if name and any(path.is_file() for path in candidates(self.detections_dir, [name], [self._ending])):
             return self._image_stems(name)
         if self._single:
@@ -175,9 +175,9 @@ class Layout:
         return sorted(found)
 
     def _detection_stems(self, folder: Path) -> list[str]:
-        """Names without ending of the result files in a folder, or in its folder `data` where there is one, sorted.
+        """Names without ending of the result files in a folder, or in its subfolder `data` if there is one, sorted.
 
-        What has no digit in its name, README.txt, is no frame unless there is an image of that name.
+        A name without digits, such as README.txt, is only a frame if an image has the same name.
         """
         nested = folder / "data"
         stems = [path.stem for path in visible_files(nested if nested.is_dir() else folder, [self._ending])]
@@ -195,11 +195,12 @@ class Layout:
 
 
 def object_layout(root: Path | str, detections_dir: Path | str) -> Layout:
-    """KITTI's object benchmark: `root/training`, else `root/testing`, else `root` itself with image_2, image_3, calib,
-    label_2, planes; detections apart.
+    """KITTI's object benchmark with image_2, image_3, calib, label_2 and planes; detections are separate.
+
+    The folders lie in `root/training`, else in `root/testing`, else in `root`.
     """
     training = Path(root) / "training"
-    # What a training folder lacks is said of its files.
+    # Errors about missing parts then name files in the training folder.
     base = _split_with(Path(root), "image_2") or (training if training.is_dir() else None)
     if base is None:
         problem = "holds no image_2, training/image_2 or testing/image_2 in KITTI's layout"
@@ -208,13 +209,15 @@ def object_layout(root: Path | str, detections_dir: Path | str) -> Layout:
 
 
 def _split_with(root: Path, folder: str) -> Path | None:
-    """Of `root/training`, `root/testing` and `root` the first with such a folder in it."""
+    """The first of `root/training`, `root/testing` and `root` that contains the given folder, or None."""
     return next((base for base in (root / "training", root / "testing", root) if (base / folder).is_dir()), None)
 
 
 def odometry_layout(root: Path | str, detections_dir: Path | str) -> Layout:
-    """KITTI's odometry benchmark in colour: `root/sequences/NN` with image_2, image_3, calib.txt and times.txt, and
-    `root/poses/NN.txt`; `root/dataset` will do for `root`, and so will the folder of one sequence.
+    """KITTI's odometry benchmark in colour.
+
+    It has `root/sequences/NN` with image_2, image_3, calib.txt and times.txt, and `root/poses/NN.txt`. `root/dataset`
+    may replace `root`, and `root` may be the folder of one sequence.
     """
     root = Path(root)
     if (root / "image_2").is_dir():
@@ -232,8 +235,10 @@ def odometry_layout(root: Path | str, detections_dir: Path | str) -> Layout:
 
 
 def stereo2015_layout(root: Path | str, detections_dir: Path | str) -> Layout:
-    """KITTI Stereo 2015 (and Scene Flow 2015): two consecutive pairs a scene, `NNNNNN_10` and `NNNNNN_11`, in
-    `root/training`, `root/testing` or `root`. Detections, masks and planes of the first may be called `NNNNNN`, too.
+    """KITTI Stereo 2015 (and Scene Flow 2015): two consecutive pairs of each scene, `NNNNNN_10` and `NNNNNN_11`.
+
+    They are in `root/training`, `root/testing` or `root`. Detections, masks and planes of the first pair may be named
+    `NNNNNN`.
     """
     base = _split_with(Path(root), "calib_cam_to_cam")
     if base is None:
@@ -243,9 +248,10 @@ def stereo2015_layout(root: Path | str, detections_dir: Path | str) -> Layout:
 
 
 def tracking_layout(root: Path | str, detections_dir: Path | str) -> Layout:
-    """A tracking sequence (`root/image_02/NNNNNN.png`, `image_03`, `calib.txt`, `label_02.txt`, `planes`), or the
-    benchmark (`root/training`, `root/testing` or `root` with `image_02/SEQUENCE/NNNNNN.png`, `image_03`,
-    `calib/SEQUENCE.txt` ..).
+    """A sequence of KITTI's tracking benchmark, or the whole benchmark.
+
+    A sequence is `root/image_02/NNNNNN.png`, `image_03`, `calib.txt`, `label_02.txt`, `planes`. The benchmark is
+    `root/training`, `root/testing` or `root` with `image_02/SEQUENCE/NNNNNN.png`, `image_03`, `calib/SEQUENCE.txt` ..
     """
     root = Path(root)
     if image_stems(root / "image_02"):
@@ -262,8 +268,10 @@ def tracking_layout(root: Path | str, detections_dir: Path | str) -> Layout:
 
 
 def raw_layout(root: Path | str, detections_dir: Path | str) -> Layout:
-    """A rectified drive of KITTI's raw data (`root/image_02/data/NNNNNNNNNN.png`, `image_03`; calibration in
-    `calib_cam_to_cam.txt` beside or in it), or a folder of such drives, of one day or of days.
+    """A rectified drive of KITTI's raw data, or a folder of such drives of one or several days.
+
+    A drive is `root/image_02/data/NNNNNNNNNN.png` and `image_03`, with `calib_cam_to_cam.txt` in it or in the folder
+    above.
     """
     root = Path(root)
     single = (root / "image_02" / "data").is_dir()
@@ -280,7 +288,7 @@ def raw_layout(root: Path | str, detections_dir: Path | str) -> Layout:
 
 def _drive(folder: Path) -> tuple[str, tuple[Path, Patterns]]:
     whole = folder.resolve()
-    # As it was named where that is possible, or paths would not begin like the root.
+    # The folder keeps its given name if possible, because paths would otherwise not begin with the root.
     base = folder.parent if folder.name == whole.name else whole.parent
     inside = (folder / "calib_cam_to_cam.txt").is_file()
     return whole.name, (base, RAW if inside else RAW_OF_DAY)

@@ -1,4 +1,4 @@
-"""Instance masks of both images of a frame, from the files that instance segmentation tools write."""
+"""This module reads the instance masks of both images of a frame from the files of instance segmentation tools."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ from directshape_torch.io.kitti_labels import frame_number
 from directshape_torch.scene import SIDES, Side
 
 COCO_CAR_IDS = frozenset({3})
-# KITTI MOTS numbers its classes 1 car, 2 pedestrian, 10 ignore; Cityscapes from 24 on, 26 being car.
+# KITTI MOTS numbers its classes 1 car, 2 pedestrian, 10 ignore; Cityscapes numbers from 24 on, with 26 for car.
 PNG_CAR_IDS = frozenset({1, 26})
 _MOTS_IGNORE_CLASS = 10
 _IDS_PER_CLASS = 1000
 # The instance files of KITTI's semantic benchmark have Cityscapes' classes, of which 24 to 33 have instances.
 _IDS_PER_SEMANTIC_CLASS, _HIGHEST_CLASS, _FIRST_THING = 256, 33, 24
-# Road of the semantic benchmark, 7 * 256, would be instance 792 of class 1.
+# The road of the semantic benchmark, 7 * 256, would otherwise be instance 792 of class 1.
 _MOST_INSTANCES = 500
 _KNOWN_CLASSES = frozenset({0, 1, 2, _MOTS_IGNORE_CLASS, *range(_FIRST_THING, _HIGHEST_CLASS + 1)})
 _TRACKING_FOLDERS = ("instance_02", "instance_03")
-# With its place in its file.
+# The index of an entry in its file comes with the entry.
 _Entry = tuple[int, Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
 class FrameJsonMasks:
-    """A folder with one `NNNNNN.json` a frame: COCO results, each with `image`: "left" or "right".
+    """A `FrameJsonMasks` is a folder with one file `NNNNNN.json` for each frame.
 
-    An entry may carry `soft_probability`, the path (from the folder of the json file) of an 8-bit PNG of the
-    foreground probability x 255, which then stands in for the binary mask.
+    Its entries are COCO results, each with `image`: "left" or "right". An entry may have `soft_probability`, the path
+    (relative to the json file) of an 8-bit PNG of the foreground probability x 255, which replaces the binary mask.
     """
 
     directory: Path  # the folder, or the one above a folder `data`
@@ -66,7 +66,7 @@ class FrameJsonMasks:
         return (path, *soft)
 
     def path(self, frame_id: str) -> Path:
-        """The file without which there are no masks of a frame.
+        """The file without which a frame has no masks.
 
         Raises:
             DataFormatError: an instance PNG lies in its place.
@@ -82,16 +82,16 @@ class FrameJsonMasks:
 
 @dataclass(frozen=True)
 class InstancePngMasks:
-    """Folders `instance_2` (left) and `instance_3` (right, if any) of PNG files with `class * 1000 + instance`.
+    """An `InstancePngMasks` reads PNG files `class * 1000 + instance` in `instance_2` and (optional) `instance_3`.
 
-    KITTI MOTS (1 car, 2 pedestrian, 10000 ignored) and Cityscapes (26 car; values below 1000 are not instances). The
-    files `instance` of KITTI's semantic benchmark, `class * 256 + instance` with Cityscapes' classes, are known by
-    their numbers.
+    It accepts KITTI MOTS (1 car, 2 pedestrian, 10000 ignored) and Cityscapes (26 car; values below 1000 are not
+    instances). Files `instance` of KITTI's semantic benchmark, `class * 256 + instance` with Cityscapes' classes, are
+    recognised by their numbers.
     """
 
-    directory: Path  # the folder that holds both, or the left one alone
+    directory: Path  # the folder above both, or above the left one only
     car_ids: frozenset[int] = PNG_CAR_IDS  # classes that are cars
-    # Names of the two; `instance_02` and `instance_03` in the layout of tracking sequences, whose instances are
+    # Names of the two folders. Instances in `instance_02` and `instance_03`, the folders of tracking sequences, are
     # tracks.
     folders: tuple[str, str] = ("instance_2", "instance_3")
 
@@ -108,7 +108,7 @@ class InstancePngMasks:
         return tuple(find_image(folder, frame_id) for folder in (left, right) if folder == left or right.is_dir())
 
     def path(self, frame_id: str) -> Path:
-        """The file without which there are no masks of a frame."""
+        """The file without which a frame has no masks."""
         return self.files(frame_id)[0]
 
     def _instances(self, path: Path, side: Side, ids: NDArray[Any]) -> Iterable[InstanceMask | None]:
@@ -127,7 +127,7 @@ class InstancePngMasks:
 
 
 def _ids_per_class(values: Sequence[int], classes: frozenset[int]) -> int:
-    """By what classes are multiplied in an image of such numbers: 1000, or 256 where those fit and these do not."""
+    """The factor of the class in instance numbers: 1000, or 256 if only that fits the classes."""
     plain, semantic = ([divmod(value, base) for value in values] for base in (_IDS_PER_CLASS, _IDS_PER_SEMANTIC_CLASS))
     known = all(category in classes and number < _MOST_INSTANCES for category, number in plain)
     fits = all(category <= _HIGHEST_CLASS for category, _ in semantic)
@@ -138,9 +138,10 @@ def _ids_per_class(values: Sequence[int], classes: frozenset[int]) -> int:
 
 @dataclass(frozen=True)
 class MotsTextMasks:
-    """The text file of a sequence of KITTI MOTS: `frame id class height width rle` a line, of the left images.
+    """A `MotsTextMasks` reads the text file of a sequence of KITTI MOTS, which describes the left images.
 
-    Instances are tracks; ids are `class * 1000 + instance`, as in the PNG files.
+    Each line is `frame id class height width rle`. Instances are tracks; ids are `class * 1000 + instance`, as in PNG
+    files.
     """
 
     path: Path
@@ -178,7 +179,7 @@ def _mots_by_frame(path: Path) -> dict[int, list[Line]]:
 
 @dataclass(frozen=True)
 class CocoFileMasks:
-    """Two plain COCO result files, left and right, with `image_id` = frame number (Detectron2, mmdet)."""
+    """A `CocoFileMasks` reads plain COCO result files, left and right, with the frame number as `image_id`."""
 
     # The files; either may be None.
     left: Path | None
@@ -190,7 +191,7 @@ class CocoFileMasks:
             raise InputError("left, right", "at least one COCO result file", "none")
 
     def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
-        # `int` would take 000046_10 for 4610.
+        # `int` would read 000046_10 as 4610.
         if not frame_id.isdecimal():
             raise InputError("frame_id", "a number, as COCO's image_id is one", repr(frame_id), "give one file a frame")
         masks = []
@@ -206,8 +207,11 @@ class CocoFileMasks:
 
 @dataclass(frozen=True)
 class LayoutMasks:
-    """Masks of the frames of a layout: in one folder (see `mask_source`), or of several sequences in one for each;
-    without a folder those of a plain folder's own files."""
+    """A `LayoutMasks` reads the masks of the frames of a layout.
+
+    They lie in one folder (see `mask_source`), or in one folder for each sequence. Without a folder they come from the
+    files of a plain folder.
+    """
 
     layout: FrameLayout
     directory: Path | None
@@ -228,7 +232,7 @@ class LayoutMasks:
 
 
 def _of_frame(directory: Path, names: Sequence[str]) -> tuple[MaskSource, str]:
-    """The masks of a frame's sequence, and what it is called there."""
+    """The masks of a frame's sequence, and the name of the frame there."""
     text = _mots_text(directory, names)
     if text is not None:
         return MotsTextMasks(text), Path(names[0]).name
@@ -239,7 +243,7 @@ def _of_frame(directory: Path, names: Sequence[str]) -> tuple[MaskSource, str]:
 
 
 def _mots_text(directory: Path, names: Sequence[str]) -> Path | None:
-    """The text file of KITTI MOTS for a frame of some names: that of its sequence, or the only one there is."""
+    """The text file of KITTI MOTS for a frame with these names: the file of its sequence, or the only file."""
     folders = [directory / name for name in ("", "data", "instances_txt")]
     texts = [directory] if directory.is_file() else [text for each in folders for text in visible_files(each, [".txt"])]
     of_sequence = [text for text in texts if any(name.startswith(f"{text.stem}/") for name in names)]
@@ -251,9 +255,7 @@ def _mots_text(directory: Path, names: Sequence[str]) -> Path | None:
 
 
 def mask_source(directory: Path | str) -> FrameJsonMasks | InstancePngMasks:
-    """The reader that fits a folder of masks: instance PNG if it holds `instance_2` (or `instance_02`), else one json
-    a frame.
-    """
+    """The reader of a folder of masks: instance PNG if it contains `instance_2` (or `instance_02`), else json files."""
     directory = Path(directory)
     if not directory.is_dir():
         raise DataFormatError(directory, "is not a folder of masks", cure="give the folder of NNNNNN.json files")
@@ -275,7 +277,7 @@ def read_coco_list(path: Path) -> list[Mapping[str, Any]]:
 
 @remembered
 def _coco_by_frame(path: Path) -> dict[int, list[_Entry]]:
-    """The entries of a file by frame; such files hold a whole data set."""
+    """The entries of a file by frame; one file contains a whole data set."""
     frames: dict[int, list[_Entry]] = {}
     for index, entry in enumerate(read_coco_list(path)):
         try:
@@ -287,7 +289,7 @@ def _coco_by_frame(path: Path) -> dict[int, list[_Entry]]:
 
 
 def _whole(value: Any) -> int:
-    """A whole number; `int` alone would cut others, and take truth for one."""
+    """A whole number; `int` alone would truncate fractions and accept booleans."""
     number = int(value)
     if isinstance(value, bool) or (isinstance(value, float) and number != value):
         raise ValueError(f"{value!r} is no whole number")
@@ -299,7 +301,7 @@ def _from_coco(
     entries: Sequence[_Entry],
     size_hw: tuple[int, int],
     car_ids: frozenset[int],
-    of_side: Side | None = None,  # None: each says of which it is
+    of_side: Side | None = None,  # None: each entry names its side
 ) -> Iterator[InstanceMask | None]:
     for index, entry in entries:
         side = of_side or entry.get("image")
@@ -310,7 +312,7 @@ def _from_coco(
             raise DataFormatError(
                 path, f"{where} has no 'segmentation'", cure="write RLE or polygons, as COCO results do"
             )
-        # Run lengths alone, without their size, are text too, and no path.
+        # Run lengths without their size are text too, but not a path.
         probability = (
             read_mask(path, where, str(soft), size_hw, path.parent)
             if soft
@@ -325,7 +327,7 @@ def _from_coco(
 
 
 def _score(entry: Mapping[str, Any]) -> float:
-    """The score of an entry; one without is as sure as the segmentation can be."""
+    """The score of an entry; an entry without a score gets 1."""
     score = 1.0 if entry.get("score") is None else float(entry["score"])
     if not np.isfinite(score):
         raise ValueError(f"score {entry['score']} is not finite")

@@ -1,10 +1,10 @@
-"""Which instance mask belongs to which object of a frame, by pixels: one assignment for all objects in an image.
+"""This module matches instance masks to objects of a frame by pixels, with one assignment for all objects in an image.
 
-An object is expected in regions of the image: in the outline of its projected 3D box; in the detector's 2D box, where
-that is of the same place; and in the right image where the disparity of its 3D box moves its left mask. How well a mask
-fits a region is `i / (m + f / 2)`, with the pixels i of the mask in the region, all pixels m of the mask, and the
-pixels f of the region that no mask covers. What another instance covers of a region says nothing against a mask, and
-what is in no mask may be hidden by something without one, so that it counts half.
+An object is expected in regions of the image: in the outline of its projected 3D box; in the detector's 2D box, if it
+overlaps the projected box; and in the right image in its left mask moved by the disparity of its 3D box. The fit of a
+mask to a region is `i / (m + f / 2)`, with the pixels i of the mask in the region, all pixels m of the mask, and the
+pixels f of the region that no mask covers. Pixels of a region that other instances cover do not reduce the fit of a
+mask. Pixels without a mask may belong to something in front of the object that has no mask, so they count half.
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ from directshape_torch.io.kitti_labels import KittiObject, poses_cam
 from directshape_torch.scene import SIDES, Side
 
 MIN_OVERLAP = 0.35
-# Two masks of one image that share more than this are the same object seen twice by the segmentation.
+# Two masks of one image whose IoU is larger show the same object, which the segmentation found twice.
 DUPLICATE_MASK_IOU = 0.5
-# What a mask counts for a box, where it fits another one of a higher score nearly as well.
+# If another box with a higher score fits a mask nearly as well, the fit of the lower box is multiplied by this factor.
 _SECOND_CHOICE, _NEARLY = 0.5, 0.8
 _FREE_PIXELS = 0.5
-# Beyond any image, but within the integers of the drawing.
+# This is outside every image, but within the integers that the drawing accepts.
 _FARTHEST_PX = 30000.0
 
 _Pixels = tuple[tuple[int, int], NDArray[np.bool_]]
-"""Upper left corner (u, v) and the pixels (h, w) from there on."""
+"""This is the upper left corner (u, v) and the pixels (h, w) from there on."""
 
 
 @dataclass(frozen=True)
 class MaskMatches:
-    """The masks of B objects, and why some have none."""
+    """A `MaskMatches` has the masks of B objects and the reasons for missing ones."""
 
     left: list[InstanceMask | None]
     right: list[InstanceMask | None]
     # For each object without a left mask the reason, else "".
     reasons: list[str]
-    # (B, 4) of the left image: the 2D box of the object; where this does not overlap the projected 3D box that of the
-    # mask, else the projected one, and NaN where the image shows nothing of it. Objects of a plain folder without a 2D
-    # box have the projected one as theirs.
+    # (B, 4) boxes in the left image. The object's own 2D box is taken if it overlaps the projected 3D box, else the box
+    # of the mask, else the projected box, and NaN if the object is outside the image. For objects of a plain folder
+    # without a 2D box the projected box is their own.
     box_2d: NDArray[np.float64]
 
 
@@ -59,13 +59,13 @@ def match_masks(
 ) -> MaskMatches:
     """Match the masks of both images to objects with a 3D box, one to one.
 
-    Masks belong to objects as they say themselves (`InstanceMask.row`), else by pixels. Masks that are no car's match
-    objects of other classes only.
+    If masks name their objects (`InstanceMask.row`), these are taken, else masks are matched by pixels. Masks of other
+    classes than cars match only objects of other classes.
 
     Args:
-        objects: all with a 3D box, of any class.
-        masks: of both images.
-        classes: the objects that are refined.
+        objects: objects of any class, all with a 3D box.
+        masks: masks of both images.
+        classes: classes of the objects that are refined.
     """
     own = {(mask.side, mask.row): mask for mask in masks if mask.row is not None}
     outlines = dict(zip(SIDES, _outlines(objects, camera), strict=True))
@@ -76,7 +76,7 @@ def match_masks(
     else:
         boxes = [_rectangle(box, size_hw) if has else None for box, has in zip(box_2d, has_box, strict=True)]
         left, right, reasons = _by_pixels(objects, masks, outlines, boxes, size_hw, classes)
-    # Where the file has no box of use, that of the mask is nearest to what a 2D detector would have found.
+    # If the file has no usable box, the box of the mask is nearest to the result of a 2D detector.
     rows = [row for row, mask in enumerate(left) if mask is not None and not has_box[row]]
     box_2d[rows] = np.array([of.mask_box for row in rows if (of := left[row])]).reshape(-1, 4)
     return MaskMatches(left, right, reasons, box_2d)
@@ -90,10 +90,10 @@ def _by_pixels(
     size_hw: tuple[int, int],
     classes: frozenset[str],
 ) -> tuple[list[InstanceMask | None], list[InstanceMask | None], list[str]]:
-    """The left and the right masks of objects, and for those without a left one why."""
+    """The left and the right masks of objects, and the reasons for missing left ones."""
     hulls = {side: [_hull(uv, size_hw) for uv in outlines[side]] for side in SIDES}
     is_wanted = [o.type in classes for o in objects]
-    # Objects that are refined come before all others, which may be the same seen as another class.
+    # Objects that are refined come before all others, which may be the same objects with another class.
     scores = np.array([0.0 if o.score is None else o.score for o in objects])
     ranks = np.where(is_wanted, scores - scores.min(initial=0.0) + scores.max(initial=0.0) + 1, scores)
 
@@ -114,7 +114,7 @@ def _by_pixels(
 def with_image_boxes(
     objects: Sequence[KittiObject], camera: StereoCamera, size_hw: tuple[int, int]
 ) -> list[KittiObject]:
-    """The objects with the 2D boxes of their projected 3D boxes where those of the file are of no use."""
+    """The objects, with unusable 2D boxes of the file replaced by the boxes around the projected 3D boxes."""
     boxes = [o for o in objects if o.has_box_3d]
     box_2d, _ = _box_2d(boxes, enclosing_boxes(_outlines(boxes, camera)[0], size_hw))
     known = iter(box_2d.tolist())
@@ -133,9 +133,9 @@ def _box_2d(
     objects: Sequence[KittiObject],
     projected: NDArray[np.float64],  # (B, 4) of the left image
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:  # (B, 4), (B,)
-    """The file's 2D boxes where they overlap the projected ones, else these, or NaN where the image shows nothing.
+    """The file's 2D boxes if they overlap the projected ones, else the projected ones, or NaN if nothing is visible.
 
-    Returns them, and where they are the file's.
+    The second result says which boxes are from the file.
     """
     given = np.array([o.box_2d for o in objects], dtype=np.float64).reshape(-1, 4)
     has_box = box_iou(given, projected).diagonal() > 0
@@ -146,7 +146,7 @@ def _box_2d(
 def assign(
     values: NDArray[np.float64],  # (B, M)
 ) -> list[int]:
-    """The assignment of largest total value (Hungarian): for each row its column, or -1; zeros pair nobody.
+    """The assignment of largest total value (Hungarian): the column of each row, or -1; zeros are never assigned.
 
     Examples:
         >>> assign(np.array([[0.9, 0.8], [0.7, 0.1]]))
@@ -163,9 +163,10 @@ def assign(
 
 
 def distinct(masks: Sequence[InstanceMask]) -> list[InstanceMask]:
-    """The masks without those that share more than a half with one of their image and kind that has a higher score.
+    """The masks without duplicates: masks whose IoU with one of higher score exceeds `DUPLICATE_MASK_IOU`.
 
-    There are two kinds, masks of cars and others: segmentations give one instance to several classes.
+    Only masks of the same image and kind are compared. The kinds are masks of cars and others, because segmentations
+    give one instance to several classes.
     """
     kept: dict[tuple[Side, bool], list[InstanceMask]] = {(side, kind): [] for side in SIDES for kind in (True, False)}
     for mask in sorted(masks, key=lambda mask: -mask.score):
@@ -179,10 +180,11 @@ def distinct(masks: Sequence[InstanceMask]) -> list[InstanceMask]:
 
 
 def hiding(masks: Sequence[InstanceMask], matched: Sequence[InstanceMask]) -> list[InstanceMask]:
-    """Those of the masks of no detection that may hide cars.
+    """The masks without a detection that may hide cars.
 
-    One that lies for more than a half on masks of detections shows these, and so does one on which the half of such a
-    mask lies that has no lower score. One whose own score is not above one half is as likely no instance at all.
+    A mask with more than half of its pixels on masks of detections shows the detections. A mask that covers more than
+    half of a detection's mask with an equal or higher score shows that detection too. A mask with a score up to one
+    half is probably no instance.
     """
     return [
         mask
@@ -194,7 +196,7 @@ def hiding(masks: Sequence[InstanceMask], matched: Sequence[InstanceMask]) -> li
 
 
 def _share_on(mask: InstanceMask, others: Sequence[InstanceMask]) -> float:
-    """The share of the pixels of a mask that lie on others of its image."""
+    """The share of the pixels of a mask that other masks of its image cover."""
     covered = np.zeros_like(mask.inside)
     for other in others:
         if other.side == mask.side:
@@ -206,7 +208,7 @@ def _share_on(mask: InstanceMask, others: Sequence[InstanceMask]) -> float:
 def _fits(
     regions: Sequence[Sequence[_Pixels | None]], masks: Sequence[InstanceMask], size_hw: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """How well (B, M) each mask fits the best of the regions of each object."""
+    """Fit (B, M) of each mask to the best of the regions of each object."""
     is_free = np.ones(size_hw, dtype=bool)
     for mask in masks:
         (u, v), (height, width) = mask.corner, mask.inside.shape
@@ -229,7 +231,7 @@ def _fits(
 
 
 def _overlap(a: _Pixels, b: _Pixels) -> list[tuple[tuple[slice, slice], tuple[slice, slice]]]:
-    """The part of both crops that is the same part of the image, as a part of each; nothing where they are apart."""
+    """The common part of two crops, as slices of each; the list is empty if they do not overlap."""
     (ua, va), (ub, vb) = a[0], b[0]
     u0, v0 = max(ua, ub), max(va, vb)
     u1, v1 = min(ua + a[1].shape[1], ub + b[1].shape[1]), min(va + a[1].shape[0], vb + b[1].shape[0])
@@ -244,7 +246,7 @@ def _overlap(a: _Pixels, b: _Pixels) -> list[tuple[tuple[slice, slice], tuple[sl
 
 
 def _common(a: _Pixels, b: _Pixels) -> int:
-    """Pixels that are in both."""
+    """Number of pixels that are in both crops."""
     return sum(int((a[1][of_a] & b[1][of_b]).sum()) for of_a, of_b in _overlap(a, b))
 
 
@@ -256,9 +258,9 @@ def mask_iou(a: InstanceMask, b: InstanceMask) -> float:
 
 def _choices(
     fits: NDArray[np.float64],  # (B, M)
-    ranks: NDArray[np.float64],  # (B,) of the objects: scores, those of objects that are refined above all others
+    ranks: NDArray[np.float64],  # (B,) scores of the objects, increased for objects that are refined
 ) -> NDArray[np.float64]:  # (B, M)
-    """One, and less where a mask fits an object of a higher rank nearly as well: there are two boxes of one car."""
+    """Factors of 1, and less if a mask fits an object of higher rank nearly as well, because one car has two boxes."""
     factors = np.ones_like(fits)
     for row, rank in enumerate(ranks.tolist()):
         better = fits[ranks > rank]
@@ -268,7 +270,7 @@ def _choices(
 
 
 def _reasons(fits: NDArray[np.float64], index: Sequence[int], objects: Sequence[KittiObject]) -> list[str]:
-    """For each object without a mask why, else ""."""
+    """The reason for each object without a mask, else ""."""
     taken_by = {column: objects[row].line_number for row, column in enumerate(index) if column >= 0}
     reasons = []
     for row, column in enumerate(index):
@@ -286,7 +288,7 @@ def _reasons(fits: NDArray[np.float64], index: Sequence[int], objects: Sequence[
 
 
 def _hull(uv: NDArray[np.float64], size_hw: tuple[int, int]) -> _Pixels | None:
-    """The pixels within the hull of points (P, 2), of which NaN are left out; None where none is in the image."""
+    """The pixels within the hull of points (P, 2), ignoring NaN, or None if none is in the image."""
     seen = uv[np.isfinite(uv).all(axis=1)]
     if not len(seen):
         return None
@@ -311,9 +313,10 @@ def _rectangle(box: NDArray[np.float64], size_hw: tuple[int, int]) -> _Pixels | 
 def _shifts_px(
     outlines: Mapping[Side, NDArray[np.float64]],  # (B, P, 2), NaN where out of sight
 ) -> list[float]:
-    """How far to the right of the left image each object lies in the right one, NaN where out of sight.
+    """Horizontal shift of each object from the left to the right image, NaN for objects without visible points.
 
-    The median of all points, in the image or not: the part of a car in the image alone would tell less.
+    It is the median over all points, also outside the image, because the part of a car within the image is less
+    accurate.
     """
     shifts: list[float] = (
         torch.from_numpy(outlines["right"] - outlines["left"])[..., 0].nanmedian(dim=1).values.tolist()
@@ -322,7 +325,7 @@ def _shifts_px(
 
 
 def _moved(mask: InstanceMask | None, shift_px: float, size_hw: tuple[int, int]) -> _Pixels | None:
-    """A left mask moved by the disparity of its object; a car shows about the same part of itself in both images."""
+    """A left mask moved by the disparity of its object, since both images show nearly the same part of a car."""
     if mask is None or not np.isfinite(shift_px):
         return None
     u, v = mask.corner

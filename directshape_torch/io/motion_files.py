@@ -1,4 +1,4 @@
-"""When the frames of a sequence were taken, and where the camera was: text files of a line a frame."""
+"""This module reads text files with the time and camera pose of each frame of a sequence, one line per frame."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from directshape_torch.numerics.checks import is_no_rotation
 
 @remembered
 def read_times(path: Path | str) -> NDArray[np.float64]:
-    """Seconds (N,) from the first line on.
+    """Times (N,) in seconds since the first line.
 
-    Of `times.txt` of KITTI's odometry benchmark (seconds), or `timestamps.txt` of its raw recordings (dates with times
-    of day).
+    The file is `times.txt` of KITTI's odometry benchmark (seconds), or `timestamps.txt` of its raw recordings (dates
+    with times of day).
     """
     lines = read_lines(path)
     seconds: NDArray[np.float64] = np.array([_seconds(path, line) for line in lines], dtype=np.float64)
@@ -32,9 +32,10 @@ def read_times(path: Path | str) -> NDArray[np.float64]:
 
 @remembered
 def read_poses(path: Path | str) -> NDArray[np.float64]:
-    """Poses (N, 4, 4) of camera 0, the frame `ref` of boxes, in that of the first line: small numbers, for float32.
+    """Poses (N, 4, 4) of camera 0, the frame `ref` of boxes, relative to the first line.
 
-    Lines are rows of a matrix (3, 4), as in KITTI's odometry benchmark.
+    Lines are rows of a matrix (3, 4), as in KITTI's odometry benchmark. Relative poses have small numbers, which suit
+    float32.
     """
     lines = read_lines(path)
     T_world_ref = np.tile(np.eye(4), (len(lines), 1, 1))
@@ -44,7 +45,7 @@ def read_poses(path: Path | str) -> NDArray[np.float64]:
 
 
 def of_line(path: Path, values: NDArray[np.float64], number: int) -> NDArray[np.float64]:
-    """What a file says of the frame of a number, from 0."""
+    """The value in a file for a frame number, from 0."""
     if number >= len(values):
         problem = f"has {len(values)} lines and none for frame {number}"
         raise DataFormatError(path, problem, cure="write a line for each frame of the sequence, from frame 0 on")
@@ -53,7 +54,7 @@ def of_line(path: Path, values: NDArray[np.float64], number: int) -> NDArray[np.
 
 def _seconds(path: Path | str, line: Line) -> float:
     try:
-        # Python knows microseconds, the recordings write nanoseconds.
+        # Python parses microseconds, but the recordings have nanoseconds.
         seconds = (
             datetime.fromisoformat(line.text[:26]).replace(tzinfo=UTC).timestamp()
             if ":" in line.text

@@ -1,4 +1,4 @@
-"""What a refinement leaves behind: KITTI result files, states and shapes of frames (schema 4), tracks through them."""
+"""This module reads and writes KITTI result files, states and shapes of frames (schema 4), and tracks."""
 
 from __future__ import annotations
 
@@ -23,17 +23,18 @@ _AGAIN = "refine the frame again"
 
 Floats = NDArray[np.floating[Any]]
 _Arrays = TypeVar("_Arrays")
-# Of arrays in a file, by the type of the field.
+# The kinds of arrays in a file are keyed by the type of the field.
 _KINDS = {"str": "U", "tuple[str, ...]": "U", "Floats": "f", "NDArray[np.int64]": "i", "NDArray[np.bool_]": "b"}
 
 
-# What a refinement changes of a result line, in its order: observation angle; height, width, length of the refined zero
-# level along the object axes; its bottom centre in `ref`; heading about the y axis of `ref`; metres and radians.
+# A refinement changes these columns of a result line, in this order: observation angle; height, width and length of the
+# refined zero level along the object axes; its bottom centre in `ref`; heading about the y axis of `ref`. Units are
+# metres and radians.
 RefinedBox = Sequence[float]
 
 
 def result_line(source: KittiObject, refined: RefinedBox) -> str:
-    """The input line with its 3D box and alpha replaced; every other column keeps the text it had.
+    """The input line with its 3D box and alpha replaced; every other column keeps its text.
 
     Examples:
         >>> from directshape_torch.io.kitti_labels import parse_object
@@ -54,7 +55,7 @@ def result_line(source: KittiObject, refined: RefinedBox) -> str:
 def write_result_text(
     path: Path | str, input_objects: Sequence[KittiObject], refined: Mapping[int, RefinedBox]
 ) -> None:
-    """Write a KITTI result file: one line per input line, in their order; those not refined byte for byte."""
+    """Write a KITTI result file with one line for each input line, in order; lines not refined stay unchanged."""
     unknown = sorted(set(refined) - set(range(len(input_objects))))
     if unknown:
         raise InputError("refined", f"indices of the {len(input_objects)} input lines", str(unknown))
@@ -66,30 +67,30 @@ def write_result_text(
 
 
 def shaped(*sizes: str | int) -> dict[str, tuple[str | int, ...]]:
-    """For the metadata of a field that `check_shapes` looks at: its sizes, letters as in the class's description."""
+    """Metadata of a field for `check_shapes`: its sizes, with letters as in the description of the class."""
     return {"shape": sizes}
 
 
 @dataclass(frozen=True)
 class ShapeArrays:
-    """Content of `OUT/shapes/NNNNNN.npz` for the B refined lines of a frame; K codes, D = 6 + K, T terms, P offsets."""
+    """A `ShapeArrays` is `OUT/shapes/NNNNNN.npz` for B refined lines; K codes, D = 6 + K, T terms, P offsets."""
 
     frame_id: str
-    prior_sha256: str  # of the shape prior whose codes these are
+    prior_sha256: str  # of the shape prior of the codes
     ground_source: str  # "file", "stereo" or "camera_height"
     input_lines: NDArray[np.int64] = field(metadata=shaped("B"))  # line numbers in the detection file, from 1
-    # Text, the name of the track of which each car is a view, "" for none.
+    # Name of the track of each car, "" for none.
     tracks: tuple[str, ...] = field(metadata=shaped("B"))
     # 0 for views that share a shape, 1, 2 .. for the parts of a track that was split, -1 for none.
     track_parts: NDArray[np.int64] = field(metadata=shaped("B"))
-    # Object to left camera, and to the frame of the labels.
+    # Object to left camera, and object to the frame of the labels.
     T_cam_obj: Floats = field(metadata=shaped("B", 4, 4))
     T_ref_obj: Floats = field(metadata=shaped("B", 4, 4))
     boxes_hwl: Floats = field(metadata=shaped("B", 3))  # metres
     boxes_location_ref: Floats = field(metadata=shaped("B", 3))  # bottom centres, metres
     boxes_rotation_y: Floats = field(metadata=shaped("B"))  # radians
     codes: Floats = field(metadata=shaped("B", "K"))  # standard deviations
-    # In the tangent (v, omega, code) of the solver; NaN where there is none.
+    # In the tangent (v, omega, code) of the solver; NaN if there is none.
     covariances: Floats = field(metadata=shaped("B", "D", "D"))
     covariances_ref: Floats = field(metadata=shaped("B", 4, 4))  # of (x, y, z, yaw) in `ref`, metres and radians
     statuses: tuple[str, ...] = field(metadata=shaped("B"))
@@ -99,30 +100,30 @@ class ShapeArrays:
     costs_before: Floats = field(metadata=shaped("B", "T"))
     costs_after: Floats = field(metadata=shaped("B", "T"))
     iterations: NDArray[np.int64] = field(metadata=shaped("B"))
-    has_mask_left: NDArray[np.bool_] = field(metadata=shaped("B"))  # bool, whether a mask of the left image was matched
-    # Overlap of the projected shape with its masks; NaN where not refined.
+    has_mask_left: NDArray[np.bool_] = field(metadata=shaped("B"))  # whether a mask of the left image was matched
+    # IoU of the projected shape and its masks; NaN if not refined.
     mask_iou_left: Floats = field(metadata=shaped("B"))
     mask_iou_right: Floats = field(metadata=shaped("B"))
-    # Mean absolute difference of the images, grey levels of 0..255.
+    # Mean absolute difference of the images, in grey levels of 0..255.
     photometric_errors_grey: Floats = field(metadata=shaped("B"))
     matched_shares: Floats = field(metadata=shaped("B"))  # share of the photometric pixels that could be compared
-    # Calibrated, see `FitQuality`.
+    # Calibrated probabilities, see `FitQuality`.
     probabilities_better: Floats = field(metadata=shaped("B"))
     probabilities_not_worse: Floats = field(metadata=shaped("B"))
-    # Between the boxes of images and detector, in the standard deviations of both; NaN where they are not known.
+    # Distance between the boxes of images and detector, in standard deviations of both; NaN if these are not known.
     distances_in_sigmas: Floats = field(metadata=shaped("B"))
     # Calibrated standard deviations of (x, y, z, yaw) in `ref`, metres and radians.
     sigmas_ref: Floats = field(metadata=shaped("B", 4))
     unseen: tuple[str, ...] = field(metadata=shaped("B"))  # text, the direction that the view shows least
-    # Standard deviations along the principal directions, falling, without priors.
+    # Standard deviations along the principal directions, in descending order, without priors.
     unseen_sigmas_m: Floats = field(metadata=shaped("B", 7))
-    # These directions, rows; columns `observability.CAR_QUANTITIES`.
+    # The principal directions as rows; columns are `observability.CAR_QUANTITIES`.
     unseen_directions: Floats = field(metadata=shaped("B", 7, 7))
     profile_offsets_px: Floats = field(metadata=shaped("P"))  # offsets of disparity
-    # Photometric cost there, see `DisparityProfile`.
+    # Photometric costs at the offsets, see `DisparityProfile`.
     profile_costs_before: Floats = field(metadata=shaped("B", "P"))
     profile_costs_after: Floats = field(metadata=shaped("B", "P"))
-    made_of: str = ""  # `FrameRecord` as JSON text, by which a run knows its own files; "" outside of a run
+    made_of: str = ""  # `FrameRecord` as JSON, by which a run recognises its files; "" outside a run
 
     def __post_init__(self) -> None:
         last = {"B": self.input_lines.shape, "K": self.codes.shape, "P": self.profile_offsets_px.shape}
@@ -140,12 +141,12 @@ def check_shapes(arrays: Any, sizes: Mapping[str, int]) -> None:
 
 
 def write_shapes(path: Path | str, shapes: ShapeArrays) -> None:
-    """Write the states and shapes of a frame, and a checksum; equal content gives equal bytes, no pickle inside."""
+    """Write the states and shapes of a frame with a checksum; equal content gives equal bytes, without pickle."""
     write_arrays(path, shapes, SHAPES_SCHEMA_VERSION)
 
 
 def write_arrays(path: Path | str, content: Any, version: int) -> None:
-    """Write the fields of a dataclass (arrays and text), and a checksum, for `read_arrays`."""
+    """Write the fields of a dataclass (arrays and text) with a checksum, for `read_arrays`."""
     arrays: dict[str, NDArray[Any]] = {"schema_version": np.array(version)}
     for entry in fields(content):
         value = getattr(content, entry.name)
@@ -186,7 +187,7 @@ def read_arrays(path: Path | str, kind: type[_Arrays], version_read: int) -> _Ar
 
 
 def _hash_arrays(arrays: Mapping[str, NDArray[Any]]) -> str:
-    """The sha256 of named arrays: name, type, shape and values."""
+    """The sha256 of the names, types, shapes and values of arrays."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         array = arrays[name]
@@ -202,36 +203,36 @@ def _from_text(array: NDArray[Any]) -> Any:
 
 
 def _decimal(number: float) -> str:
-    """Four decimals, a tenth of a millimetre, without a negative zero."""
+    """Four decimals (0.1 mm), without a negative zero."""
     return f"{round(float(number), 4) + 0.0:.4f}"
 
 
 @dataclass(frozen=True)
 class TrackArrays:
-    """A car in F frames, K codes, D = 6 + K; each view as its frame's `ShapeArrays` has it."""
+    """A `TrackArrays` is a car in F frames; K codes, D = 6 + K; views equal entries of the frames' `ShapeArrays`."""
 
     track: str
-    prior_sha256: str  # of the shape prior whose codes these are
-    # Its shape, that of the refined view which knows it best; NaN where no view was refined.
+    prior_sha256: str  # of the shape prior of the codes
+    # Code of the refined view with the smallest covariance; NaN if no view was refined.
     code: Floats = field(metadata=shaped("K"))
-    code_covariance: Floats = field(metadata=shaped("K", "K"))  # of it
-    dimensions_hwl: Floats = field(metadata=shaped(3))  # of that shape, metres
-    frame_ids: tuple[str, ...] = field(metadata=shaped("F"))  # text, in the order of the frames
+    code_covariance: Floats = field(metadata=shaped("K", "K"))  # covariance of the code
+    dimensions_hwl: Floats = field(metadata=shaped(3))  # of the shape of the code, metres
+    frame_ids: tuple[str, ...] = field(metadata=shaped("F"))  # in the order of the frames
     input_lines: NDArray[np.int64] = field(metadata=shaped("F"))  # line numbers in the detection files, from 1
-    statuses: tuple[str, ...] = field(metadata=shaped("F"))  # text
-    # 0 for views that share a shape, 1, 2 .. for later ones that cannot be the same car, -1 for a view that shares
-    # with none.
+    statuses: tuple[str, ...] = field(metadata=shaped("F"))  # names of `Status`
+    # 0 for views that share a shape, 1, 2 .. for later views that cannot show the same car, -1 for a view that shares
+    # no shape.
     parts: NDArray[np.int64] = field(metadata=shaped("F"))
-    # Object to left camera, and to the frame of the labels.
+    # Object to left camera, and object to the frame of the labels.
     T_cam_obj: Floats = field(metadata=shaped("F", 4, 4))
     T_ref_obj: Floats = field(metadata=shaped("F", 4, 4))
-    # And boxes_rotation_y (F,): the boxes of the result lines.
+    # The boxes of the result lines.
     boxes_hwl: Floats = field(metadata=shaped("F", 3))
     boxes_location_ref: Floats = field(metadata=shaped("F", 3))
     boxes_rotation_y: Floats = field(metadata=shaped("F"))
-    # One and the same in all views of a call; views that were not trusted keep their own.
+    # Equal in all views of a call, except that untrusted views keep their own code.
     codes: Floats = field(metadata=shaped("F", "K"))
-    # In the tangent (v, omega, code) of the solver; NaN where there is none.
+    # In the tangent (v, omega, code) of the solver; NaN if there is none.
     covariances: Floats = field(metadata=shaped("F", "D", "D"))
 
     def __post_init__(self) -> None:
@@ -239,7 +240,7 @@ class TrackArrays:
 
 
 def track_name(sequence: str, track_id: int) -> str:
-    """What the files of a track are called.
+    """The name of a track in file names, "" for a car without a track.
 
     Examples:
         >>> track_name("", 7), track_name("0005", 31), track_name("0005", -1)
@@ -261,7 +262,7 @@ def read_track(path: Path | str) -> TrackArrays:
 
 
 def write_tracks(out_dir: Path | str, frames: Iterable[ShapeArrays]) -> list[str]:
-    """Write the file of every track that goes through some finished frames of a run, in their order.
+    """Write a file for every track in the finished frames of a run, in the order of the frames.
 
     Returns:
         The tracks that were split.
@@ -283,7 +284,7 @@ def _track(track: str, views: list[tuple[ShapeArrays, int]]) -> TrackArrays:
     statuses = tuple(shapes.statuses[car] for shapes, car in views)
     codes, covariances, boxes_hwl = stacked("codes"), stacked("covariances"), stacked("boxes_hwl")
     is_refined = np.array([Status[status].is_refined for status in statuses])
-    # A view that was not refined knows nothing, and a covariance that is not finite says nothing.
+    # Views that were not refined or have no finite covariance are not candidates.
     variance = np.trace(covariances[:, 6:, 6:], axis1=1, axis2=2)
     best = int(np.argmin(np.where(is_refined & np.isfinite(variance), variance, np.inf)))
     unknown = 1.0 if is_refined.any() else np.nan

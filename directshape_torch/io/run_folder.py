@@ -1,7 +1,7 @@
-"""The output folder of `directshape refine`, read frame by frame: the one reader of results.
+"""This module reads the output folder of `directshape refine` frame by frame; every other reader of results uses it.
 
-A frame is done when `data/NNNNNN.txt` and `shapes/NNNNNN.npz` exist and the latter says that the folder's manifest and
-the former's bytes belong to it. Both are written whole or not at all, so nothing else need be asked.
+A frame is done if `data/NNNNNN.txt` and `shapes/NNNNNN.npz` exist, and the latter contains the hashes of the folder's
+manifest and of the former. Each file is written completely or not at all, so no further check is needed.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from directshape_torch.io.run_manifest import FrameEntry, hash_bytes, read_manif
 from directshape_torch.status import Status
 
 COPIED = "copied"
-"""The status of lines of other classes, which a refinement leaves as they are."""
+"""This is the status of lines of other classes, which a refinement does not change."""
 
 _AGAIN = "refine the frame again"
-# The summary names cars whose probability to be not worse is below this, and so many of a frame at most.
+# The summary names cars whose probability to be not worse is below `_SURE`, at most `_MOST_DOUBTFUL` of a frame.
 _SURE, _MOST_DOUBTFUL = 0.95, 3
-# Within the folder, whoever has written the name.
+# File names in a record must stay within the folder, since anybody may have written them.
 _FILE = re.compile(r"(data|shapes|meshes|overlays)/[^/\\]+")
 
 
 def summary_path(out_dir: Path | str) -> Path:
-    """What the results of a folder were made of."""
+    """The file that describes how the results of a folder were made."""
     return Path(out_dir) / "summary.json"
 
 
@@ -67,23 +67,23 @@ def mesh_path(out_dir: Path | str, frame_id: str, line_number: int, mesh_format:
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """What the files of a frame were made of; `shapes/NNNNNN.npz` carries it."""
+    """A `FrameRecord` says how the files of a frame were made; `shapes/NNNNNN.npz` contains it."""
 
     run: str  # hash of the manifest
     inputs: Mapping[str, str]  # sha256 of the files of the data set, by their role
     # Kinds of files that the frame has: "data", "shapes", "meshes_ply", "meshes_glb", "overlays".
     outputs: Sequence[str]
-    files: Mapping[str, str]  # sha256 of each of them but the one that this stands in, by its path in the output folder
-    lines: int  # of the detection file
-    masks_right: int  # cars with a mask in the right image
+    files: Mapping[str, str]  # sha256 of each file but the one with this record, by path in the output folder
+    lines: int  # number of lines in the detection file
+    masks_right: int  # number of cars with a mask in the right image
 
     def files_of(self, outputs: Iterable[str]) -> dict[str, str]:
-        """Those of `files` that belong to some kinds of outputs."""
+        """The entries of `files` that belong to the given kinds of outputs."""
         kinds = set(outputs)
         return {name: sha256 for name, sha256 in self.files.items() if _kind(name) in kinds}
 
     def text(self) -> str:
-        """For `ShapeArrays.made_of`."""
+        """JSON text of the record for `ShapeArrays.made_of`."""
         return json.dumps(asdict(self), sort_keys=True)
 
 
@@ -103,9 +103,9 @@ def read_record(path: Path, shapes: ShapeArrays) -> FrameRecord:
 def read_done(
     out_dir: Path, frame_id: str, run: str, outputs: Iterable[str] = ("data",)
 ) -> tuple[ShapeArrays, FrameRecord]:
-    """The shapes of a frame that is done, and what its files were made of.
+    """The shapes and the record of a frame that is done.
 
-    Its files of the kinds `outputs` must be there with the bytes that were written, by the run of that hash.
+    Its files of the kinds `outputs` must exist with unchanged bytes, written by the run with the hash `run`.
     """
     path = shapes_path(out_dir, frame_id)
     shapes = read_shapes(path)
@@ -121,7 +121,7 @@ def read_done(
 
 
 def frame_entry(shapes: ShapeArrays, record: FrameRecord) -> FrameEntry:
-    """What `summary.json` says of a frame that is done."""
+    """The entry of `summary.json` for a frame that is done."""
     cars = zip(shapes.input_lines.tolist(), shapes.statuses, shapes.messages, strict=True)
     better, worse, doubtful = _expected(shapes)
     return {
@@ -140,10 +140,10 @@ def frame_entry(shapes: ShapeArrays, record: FrameRecord) -> FrameEntry:
 
 
 def _expected(shapes: ShapeArrays) -> tuple[float, float, dict[str, list[float]]]:
-    """How many refined cars are better and worse than their boxes, and those that are worse most probably.
+    """Expected numbers of refined cars that are better and worse than their boxes, and the most doubtful cars.
 
-    These are by line the probability to be not worse and the distance from the detector's box in standard deviations
-    (-1 where it is not known).
+    The entry of a doubtful car, by line number, is its probability to be not worse and its distance from the detector's
+    box in standard deviations (-1 if it is not known).
     """
     refined = np.array([Status[name].is_refined for name in shapes.statuses], dtype=bool)
     not_worse = shapes.probabilities_not_worse
@@ -160,12 +160,12 @@ def _expected(shapes: ShapeArrays) -> tuple[float, float, dict[str, list[float]]
 
 @dataclass(frozen=True)
 class ResultObject:
-    """One result line with a 3D box, refined or not."""
+    """A `ResultObject` is one result line with a 3D box, refined or not."""
 
-    line: KittiObject  # type, 2D box, score and whatever else the detector said
+    line: KittiObject  # type, 2D box, score and the other columns of the detector
     status: str  # name of the `Status` of a car, or "copied"
-    car: int  # row in the frame's `ShapeArrays`, -1 for lines that are not in it
-    # (3, 3) axes of the object (forward, down, left) in `ref`; of a refined car with its tilt.
+    car: int  # row in the frame's `ShapeArrays`, -1 for lines without one
+    # (3, 3) axes of the object (forward, down, left) in `ref`; a refined car includes its tilt.
     R_ref_obj: NDArray[np.float64]
     bottom_ref: NDArray[np.float64]  # (3,) bottom centre of the box in `ref`, metres
     hwl: NDArray[np.float64]  # (3,) height, width, length, metres
@@ -177,18 +177,18 @@ class ResultObject:
 
     @property
     def centre_ref(self) -> NDArray[np.float64]:
-        """The centre (3,) of the box in `ref`, metres: half its height above the bottom centre."""
+        """The centre (3,) of the box in `ref`, metres, half its height above the bottom centre."""
         return np.asarray(self.bottom_ref - 0.5 * self.hwl[0] * self.R_ref_obj[:, 1])
 
 
 @dataclass(frozen=True)
 class FrameResult:
-    """What a run left of one frame."""
+    """A `FrameResult` has the results of a run for one frame."""
 
     frame_id: str
     lines: tuple[KittiObject, ...]  # every line of the result file
-    shapes: ShapeArrays  # states and shapes of its cars
-    record: FrameRecord  # what it was made of
+    shapes: ShapeArrays  # states and shapes of the cars
+    record: FrameRecord  # how the files were made
     mesh_files: tuple[Path | None, ...] = ()  # the saved mesh of each car, or None
 
     @property
@@ -211,14 +211,14 @@ class FrameResult:
 
 
 class RunFolder:
-    """An output folder of `directshape refine`, while the run goes on and after it was cut off too.
+    """A `RunFolder` is an output folder of `directshape refine`, also of a running or interrupted run.
 
     Args:
-        path: holds `summary.json`, `data` and `shapes`.
-        frames: ids to read, "000107" or as a number with zeros or without; default all that are done.
+        path: folder with `summary.json`, `data` and `shapes`.
+        frames: ids to read, "000107" or a number with or without zeros; default are all frames that are done.
 
     Attributes:
-        manifest: what its results were made of.
+        manifest: how the results were made.
         frame_ids: the chosen frames that are done, in order.
     """
 
@@ -252,14 +252,14 @@ class RunFolder:
             raise DataFormatError(summary_path(self.path), f"config.refiner: {error}") from error
 
     def read(self, frame_id: str) -> FrameResult:
-        """The results of a frame that is done; raises as `read_done`."""
+        """The results of a frame that is done; errors are those of `read_done`."""
         shapes, record = read_done(self.path, frame_id, self.manifest.hash)
         text = result_path(self.path, frame_id)
         lines = tuple(read_objects(text))
         if not set(shapes.input_lines.tolist()) <= {line.line_number for line in lines}:
             raise DataFormatError(text, f"lacks lines of {shapes_path(self.path, frame_id)}", cure=_AGAIN)
         names = record.files_of(("meshes_ply", "meshes_glb"))
-        # "meshes/NNNNNN_LINE.ply"; a frame's name may hold an underscore too.
+        # Files are named "meshes/NNNNNN_LINE.ply". The name of a frame may contain an underscore too.
         saved = {Path(name).stem.rpartition("_")[2]: self.path / name for name in names}
         meshes = (saved.get(str(line)) for line in shapes.input_lines.tolist())
         whole = tuple(mesh if mesh is not None and mesh.is_file() else None for mesh in meshes)
@@ -288,7 +288,7 @@ def _object(line: KittiObject, car: int, shapes: ShapeArrays) -> ResultObject:
 
 
 def _nearest_rotation(R: NDArray[Any]) -> NDArray[np.float64]:
-    """A rotation kept in float32 is one to seven digits; other programs check more of them."""
+    """The rotation nearest to a float32 one, exact to the digits that other programs check."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_matrix(R.astype(np.float64)).as_matrix())

@@ -1,6 +1,6 @@
-"""`summary.json` of a run (schema 2): what made its results, and how each frame ended, so that a run can resume.
+"""This module reads and writes `summary.json` of a run (schema 2), so that a run can resume.
 
-Nothing in it depends on the time, the machine or where the files lie.
+The file says how the results were made and how each frame ended. Its content does not depend on time, machine or paths.
 """
 
 from __future__ import annotations
@@ -24,31 +24,31 @@ from directshape_torch.shape.shape_prior import ShapePrior
 
 MANIFEST_SCHEMA_VERSION = 2
 RESUME_CURE = "choose another output folder, or start again with --fresh, which removes the results in this one"
-# Nobody knows which files are results there, so --fresh removes none.
+# Without a valid summary it is unknown which files are results, so --fresh removes none.
 UNKNOWN_CURE = "choose another output folder, or remove this one"
 
 
 class RunSettings(TypedDict, total=False):
-    """Those of `config` that others than the refiner read."""
+    """A `RunSettings` has the settings of `config` that other modules than the refiner read."""
 
     classes: list[str]
     refiner: dict[str, Any]
 
 
 class SharedHashes(TypedDict):
-    """sha256 of what serves all frames: of the shape prior, and of the bias maps where there are any."""
+    """A `SharedHashes` has the sha256 of the shape prior and, if there are any, of the bias maps."""
 
     prior: str
     stereo_bias: str | None
 
 
 class _FrameState(TypedDict):
-    # By itself: `Required` in an annotation that is a string, as all are here, is overlooked at run time.
+    # This key has a class of its own, because `Required` in a string annotation is ignored at run time.
     state: Literal["done", "failed"]
 
 
 class FrameEntry(_FrameState, total=False):
-    """What `frames` says of one frame: of one that is done all but the reason, of a failed one the reason."""
+    """A `FrameEntry` describes one frame in `frames`; a failed frame has only `reason`, others have the rest."""
 
     reason: str
     lines: int
@@ -65,22 +65,22 @@ class FrameEntry(_FrameState, total=False):
 
 @dataclass(frozen=True)
 class RunManifest:
-    """What a run was made of and how far it came."""
+    """A `RunManifest` says how the results of a run were made and how each frame ended."""
 
     package_version: str  # of this package
-    config: Mapping[str, Any]  # every setting that bears on the results, nested as in the configuration file
-    sha256: SharedHashes  # hashes of what serves all frames
+    config: Mapping[str, Any]  # every setting that affects the results, nested as in the configuration file
+    sha256: SharedHashes  # hashes of the files that all frames use
     frames: dict[str, FrameEntry] = field(default_factory=dict)  # how each frame ended
 
     @property
     def hash(self) -> str:
-        """Of all but the frames; the files of a frame carry it."""
+        """Hash of all fields except the frames; the files of a frame contain it."""
         made_of = [self.package_version, self.config, self.sha256]
         return hash_bytes(json.dumps(made_of, sort_keys=True, default=list).encode())
 
     @property
     def failed(self) -> dict[str, str]:
-        """Why frames could not be refined."""
+        """The reason of each frame that could not be refined."""
         frames = sorted(self.frames.items())
         return {name: entry.get("reason", "unknown") for name, entry in frames if entry["state"] == "failed"}
 
@@ -97,19 +97,19 @@ def hash_bytes(content: bytes) -> str:
 
 @remembered
 def hash_file(path: Path) -> str:
-    """The sha256 of a file, hexadecimal; mask files of a whole data set serve every frame, and may be large."""
+    """The sha256 of a file, hexadecimal; it is cached, since mask files of a whole data set serve every frame."""
     return hash_bytes(read_bytes(path))
 
 
 def hash_files(files: Mapping[str, Path]) -> dict[str, str]:
-    """The sha256 of several files by their role, such as those of `StereoDataset.input_files`."""
+    """The sha256 of several files by their role, such as `StereoDataset.input_files` gives."""
     return {role: hash_file(path) for role, path in files.items()}
 
 
 def hash_tensors(tensors: Mapping[str, Tensor]) -> str:
     """The sha256 (hexadecimal) of named tensors: name, shape and values as float64, little-endian, in order of name.
 
-    By content, so that it does not depend on a file's name or compression.
+    The hash does not depend on a file's name or compression.
 
     Examples:
         >>> hash_tensors({"a": torch.zeros(2)}) == hash_tensors({"a": torch.zeros(2, dtype=torch.float64)})
@@ -124,13 +124,13 @@ def hash_tensors(tensors: Mapping[str, Tensor]) -> str:
 
 
 def hash_prior(prior: ShapePrior) -> str:
-    """The sha256 of a shape prior: of its buffers, weights and bounds."""
+    """The sha256 of the buffers, weights and bounds of a shape prior."""
     tensors = {**dict(prior.named_buffers()), **dict(prior.named_parameters())}
     return hash_tensors({"bounds_obj": prior.bounds_obj, **tensors})
 
 
 def hash_fields(fields: Sequence[DisparityField]) -> str | None:
-    """The sha256 of residual disparity fields, or None without any; of one alone, that of its tensors."""
+    """The sha256 of residual disparity fields, or None without any; one field has the hash of its tensors."""
     hashes = []
     for one in fields:
         tensors = {name: value for name, value in vars(one).items() if isinstance(value, Tensor)}
@@ -141,16 +141,16 @@ def hash_fields(fields: Sequence[DisparityField]) -> str | None:
 
 
 def write_manifest(path: Path | str, manifest: RunManifest) -> None:
-    """Write `summary.json`, and wait for the disk: without it nobody would know what the results are."""
+    """Write `summary.json` and wait for the disk, since results cannot be resumed or read without it."""
     atomic_files.write_json(path, {"schema_version": MANIFEST_SCHEMA_VERSION, **vars(manifest)}, durable=True)
 
 
 def read_manifest(path: Path | str) -> RunManifest | None:
-    """The manifest of an earlier run, or None where there is no such file.
+    """The manifest of an earlier run, or None if there is no such file.
 
     Raises:
-        DataFormatError: the file is no manifest.
-        ResumeError: it is of another schema version.
+        DataFormatError: the file is not a manifest.
+        ResumeError: the file has another schema version.
     """
     if not Path(path).is_file():
         return None
@@ -173,7 +173,7 @@ def check_resume(previous: RunManifest, current: RunManifest) -> None:
     """Refuse to mix results of different settings or files in one folder.
 
     Raises:
-        ResumeError: names the first setting or file that differs, with both values.
+        ResumeError: a setting or file differs; the error names the first one with both values.
     """
     _check_same("package version", previous.package_version, current.package_version)
     check_mapping("setting", flatten(previous.config), flatten(current.config))
@@ -193,7 +193,7 @@ def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         if isinstance(value, Mapping):
             flat |= flatten(value, f"{key}.")
         else:
-            # As JSON gives it back, which knows no tuples.
+            # JSON has no tuples, so values are compared as lists.
             flat[key] = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
     return flat
 
@@ -210,6 +210,6 @@ def _check_same(what: str, before: Any, now: Any) -> None:
 
 
 def _short(value: Any) -> str:
-    """The first twelve letters of a hash tell two files apart; settings are shown in full."""
+    """The first twelve letters of a hash, which distinguish two files, or the full text of a setting."""
     is_hash = isinstance(value, str) and len(value) == hashlib.sha256().digest_size * 2
     return value[:12] if is_hash else repr(value)

@@ -1,4 +1,4 @@
-"""Stereo data sets of any layout, with detections and masks, frame by frame as the tensors a refinement takes."""
+"""This module loads stereo data sets of any layout, with detections and masks, frame by frame as tensors."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from directshape_torch.stereo_matching.plane_from_points import estimate_ground_
 
 GroundSource = Literal["auto", "file", "stereo", "camera_height"]
 LayoutName = Literal["kitti", "raw", "tracking", "odometry", "stereo2015", "folder"]
-# `NNNNNN_10.png`, as submissions to KITTI Stereo 2015 call the first pair of a scene, else `NNNNNN.png`.
+# The first pair of a scene is `NNNNNN_10.png` in submissions to KITTI Stereo 2015; other frames are `NNNNNN.png`.
 _DISPARITIES = ("_10.png", ".png")
 _LAYOUTS: dict[LayoutName, Callable[..., FrameLayout]] = {
     "kitti": object_layout,
@@ -56,15 +56,15 @@ _LAYOUTS: dict[LayoutName, Callable[..., FrameLayout]] = {
 
 @dataclass(frozen=True)
 class LoadedFrame:
-    """One frame of a data set, ready for a refinement.
+    """A `LoadedFrame` is one frame of a data set, ready for a refinement.
 
     Attributes:
         frame: a batch of one frame.
         detections: the B objects to refine, with masks.
         input_objects: every line of the detection file, in its order.
-        refined_rows: for each input line the index of its detection, or -1 for lines to copy as they are.
-        labels: the ground truth, or None where there is no label file.
-        sequence: whose frames the tracks of the detections go through; see `StereoDataset.sequence_of`.
+        refined_rows: for each input line the index of its detection, or -1 for lines that are copied unchanged.
+        labels: the ground truth, or None if there is no label file.
+        sequence: sequence of the tracks of the detections; see `StereoDataset.sequence_of`.
         no_mask_reasons: for each detection why it has no left mask, else "".
     """
 
@@ -111,30 +111,32 @@ def open_dataset(
     """The data set of a layout (docs/inputs.md).
 
     Args:
-        layout: "kitti" (object benchmark), "raw", "tracking", "odometry", "stereo2015" or "folder"; or one of your own,
-            which needs neither `root` nor `detections_dir`.
+        layout: "kitti" (object benchmark), "raw", "tracking", "odometry", "stereo2015" or "folder"; or a user's own
+            layout, which needs neither `root` nor `detections_dir`.
         root: folder of the data.
-        detections_dir: folder of detections; None for "folder" only: `root/frames`.
-        masks: folder of masks (see `mask_source`), a text file of KITTI MOTS, a `MaskSource`, or None: those of a
-            "folder", else none.
-        split: file with a frame a line: its id, its number, or its image; default every frame that has detections.
-        frames: ids of the frames to use, of those.
+        detections_dir: folder of detections; None is allowed for "folder" and means `root/frames`.
+        masks: folder of masks (see `mask_source`), a text file of KITTI MOTS, or a `MaskSource`. None means the masks
+            in the files of a "folder", and no masks in other layouts.
+        split: file with one frame in each line: its id, number or image. Default: every frame that has detections.
+        frames: ids of the frames to use, out of the split.
         classes: object types to refine; other lines are copied.
-        ground: where ground planes come from: "auto" is file, else stereo, else camera height; with a disparity
-            field stereo comes first, for plane files share the bias of the disparities they were made from.
-        camera_height_m: height of the camera above a level ground, the last resort.
-        disparity_field: residual disparity of the rig, of several rigs, or None.
-        disparity_dir: folder of `NNNNNN.png` (or `NNNNNN_10.png`) with the disparity maps of any stereo method, for the
-            methods that fit a point cloud; None: they match the images themselves.
-        lidar_dir: folder of KITTI's LiDAR scans `NNNNNN.bin`, which the calibration of the frames places; None: frames
-            come without points.
-        tracks: number the cars over the frames of a sequence (`Detections.track_id`): by the detection files, else by
-            the masks of KITTI MOTS, else by `associate`; with times and camera poses of the frames where there are any.
-        dtype: of the tensors.
+        ground: source of ground planes. "auto" is file, else stereo, else camera height; with a disparity field stereo
+            comes first, because plane files have the bias of the disparities that they were made from.
+        camera_height_m: height of the camera above a level ground, if no plane is found.
+        disparity_field: residual disparity of the rig, or of several rigs, or None.
+        disparity_dir: folder of `NNNNNN.png` (or `NNNNNN_10.png`) with disparity maps of any stereo method, for methods
+            that fit a point cloud. None means that these methods match the images themselves.
+        lidar_dir: folder of KITTI's LiDAR scans `NNNNNN.bin`, whose pose is in the calibration of the frames. None
+            means frames without points.
+        tracks: whether to number the cars over the frames of a sequence (`Detections.track_id`): by the detection
+            files, else by the masks of KITTI MOTS, else by `associate`. Frames then have times and camera poses if
+            there are any.
+        dtype: dtype of the tensors.
 
     Raises:
-        DataFormatError: a folder or the split file is missing, or the data are not laid out so.
-        InputError: an unknown layout or `ground`, no detections, no frames, or tracks in a layout without sequences.
+        DataFormatError: a folder or the split file is missing, or the data have another layout.
+        InputError: the layout or `ground` is unknown, there are no detections or frames, or `tracks` is used in a
+            layout without sequences.
     """
     if isinstance(layout, str):
         if layout not in _LAYOUTS:
@@ -175,7 +177,7 @@ def _folder(path: Path | str | None, what: str) -> Path | None:
 
 @dataclass(eq=False)
 class StereoDataset:
-    """Frames with detections and masks, whose files a layout finds; see `open_dataset`."""
+    """A `StereoDataset` has frames with detections and masks, whose files a layout finds; see `open_dataset`."""
 
     layout: FrameLayout
     masks: MaskSource | None
@@ -188,17 +190,17 @@ class StereoDataset:
     lidar_dir: Path | None
     tracks: bool
     dtype: torch.dtype
-    # By sequence and frame, made when they are first asked for.
+    # Track numbers by sequence and frame, computed on first use.
     _tracks: dict[str | None, dict[str, list[int]]] = field(default_factory=dict, init=False, repr=False)
 
     def __len__(self) -> int:
         return len(self.frame_ids)
 
     def load(self, frame_id: str) -> LoadedFrame:
-        """Read everything of one frame.
+        """Read all data of one frame.
 
         Raises:
-            DataFormatError: a file is missing or damaged; names file and reason.
+            DataFormatError: a file is missing or damaged; the error names file and reason.
         """
         files = self.layout.files(frame_id)
         left, right = read_pair(files.left, files.right)
@@ -228,12 +230,12 @@ class StereoDataset:
         return LoadedFrame(frame, detections, objects, rows, files.read_labels(), sequence, reasons)
 
     def scan(self, frame_id: str) -> tuple[Tensor, StereoCamera]:
-        """All points (P, 3) of the LiDAR scan of a frame in its left camera, metres, float64, and that camera.
+        """All points (P, 3) of a frame's LiDAR scan in its left camera, metres, float64, and that camera.
 
-        The camera has no disparity field: a scan has no part in the rig's error.
+        The camera has no disparity field, because the scan is not affected by the rig's error.
 
         Raises:
-            DataFormatError: the scan is missing or damaged, or the calibration does not say where the scanner is.
+            DataFormatError: the scan is missing or damaged, or the calibration lacks the pose of the scanner.
             InputError: the data set was opened without scans.
         """
         if self.lidar_dir is None:
@@ -243,15 +245,15 @@ class StereoDataset:
         return read_scan(files.within(self.lidar_dir, ".bin"), calibration), to_stereo_camera(calibration)
 
     def objects(self, frame_id: str) -> list[KittiObject]:
-        """The detections of a frame alone, without its images."""
+        """The detections of a frame, read without its images."""
         return self.layout.files(frame_id).read_objects()
 
     def sequence_of(self, frame_id: str) -> str | None:
-        """The sequence through which the tracks of a frame go, "" where there is but one; None: it has no tracks."""
+        """The sequence of the tracks of a frame, "" if there is only one, or None if the frame has no tracks."""
         return self.layout.sequence_of(frame_id) if self.tracks else None
 
     def input_files(self, frame_id: str) -> dict[str, Path]:
-        """The files that `load` reads for a frame and that bear on its result, by their role."""
+        """The files that `load` reads for a frame and that affect its result, by their role."""
         files = self.layout.files(frame_id)
         roles = {
             "image_left": files.left,
@@ -270,7 +272,7 @@ class StereoDataset:
         return {role: path for role, path in roles.items() if path is not None}
 
     def _track_id(self, frame_id: str, rows: tuple[int, ...], mask_tracks: tuple[int, ...]) -> Tensor:
-        """(B,) of the detections: by the masks, else by the detections themselves."""
+        """Track numbers (B,) of the detections, by the masks if they have tracks, else by the detection files."""
         if any(track >= 0 for track in mask_tracks):
             return torch.tensor(mask_tracks)
         sequence = self.sequence_of(frame_id)
@@ -280,11 +282,11 @@ class StereoDataset:
         return torch.tensor([track for track, row in zip(ids, rows, strict=True) if row >= 0], dtype=torch.int64)
 
     def _tracks_of(self, sequence: str | None) -> dict[str, list[int]]:
-        """Of all frames of a sequence, whichever of them are used: those of its files, or associated."""
+        """Track numbers of all frames of a sequence, also of unused ones, from its files or by association."""
         objects: dict[str, list[KittiObject]] = {}
         for frame_id in self.layout.frame_ids():
             if self.layout.sequence_of(frame_id) == sequence:
-                # A file that cannot be read is reported when its turn comes.
+                # A file that cannot be read is reported when its frame is loaded.
                 with contextlib.suppress(DirectShapeError, OSError):
                     objects[frame_id] = self._objects_in_image(frame_id)
         given = {frame_id: [found.track_id for found in frame] for frame_id, frame in objects.items()}
@@ -293,9 +295,9 @@ class StereoDataset:
         return dict(zip(objects, associate(list(objects.values())), strict=True))
 
     def _objects_in_image(self, frame_id: str) -> list[KittiObject]:
-        """The detections of a frame with 2D boxes of use, without a look at its images."""
+        """The detections of a frame with usable 2D boxes, read without its images."""
         camera = to_stereo_camera(self.layout.files(frame_id).read_calibration())
-        # The centre is near the middle of an image.
+        # The principal point is near the middle of an image.
         width, height = (2 * int(x) for x in camera.K_left[0, :2, 2])
         return with_image_boxes(self.objects(frame_id), camera, (height, width))
 
@@ -312,7 +314,7 @@ class StereoDataset:
         return in_image(points, size_hw, camera)[None].to(self.dtype)
 
     def _motion(self, files: FrameFiles, camera: StereoCamera) -> tuple[Tensor | None, Tensor | None]:
-        """Time (1,) and pose (1, 4, 4) of the left camera, where cars have numbers and that is known."""
+        """Time (1,) and pose (1, 4, 4) of the left camera if tracks are used and these are known, else None."""
         time_s, T_world_ref = files.read_motion() if self.tracks else (None, None)
         T_world_cam = None
         if T_world_ref is not None:
@@ -324,9 +326,9 @@ class StereoDataset:
     def _ground(
         self, files: FrameFiles, left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera
     ) -> GroundPlane:
-        """The plane of the first source that has one, of those that `self.ground` allows.
+        """The plane of the first source that has one, in the order that `self.ground` selects.
 
-        Plane files are commonly made from raw disparity and share its bias, so with a disparity field "auto" asks the
+        Plane files are commonly made from raw disparity and have its bias, so with a disparity field "auto" tries the
         corrected stereo pair first.
         """
         orders: dict[GroundSource, tuple[GroundSource, ...]] = {
@@ -354,12 +356,12 @@ class StereoDataset:
 
 
 def _to_tensor(rgb: NDArray[np.uint8], dtype: torch.dtype) -> Tensor:
-    """(1, 3, H, W) in [0, 1] from uint8 (H, W, 3)."""
+    """Image (1, 3, H, W) in [0, 1] from uint8 (H, W, 3)."""
     return torch.from_numpy(rgb).permute(2, 0, 1)[None].to(dtype).contiguous() / 255
 
 
 def _has_image(layout: FrameLayout, frame_id: str) -> bool:
-    """Whether there is a frame of a name that may be any word."""
+    """Whether there is a frame with the given name, which may be any word."""
     try:
         return layout.files(frame_id).left.is_file()
     except InputError:

@@ -1,4 +1,4 @@
-"""Which detections of consecutive frames are the same car, where no file says so: overlap of boxes and their motion."""
+"""This module associates detections of consecutive frames that show one car, by overlap of boxes and their motion."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.mask_matching import assign
 
-# A car that is not found again within so many frames is a new one.
+# A car that is missing in more consecutive frames than this gets a new track.
 _LONGEST_GAP = 2
 _LEAST_OVERLAP = 0.3
-# From one frame to the next a depth changes by less, detector's errors and oncoming traffic included.
+# The depths of a car in consecutive frames have a smaller ratio, including detector errors and oncoming traffic.
 _DEPTH_RATIO = 1.5
 
 
@@ -36,11 +36,11 @@ class _Track:
 
 
 def associate(frames: Sequence[Sequence[KittiObject]]) -> list[list[int]]:
-    """Number the objects of consecutive frames, from 0; -1 for those without a 3D box.
+    """Number the objects of consecutive frames from 0; objects without a 3D box get -1.
 
-    From frame to frame the assignment of largest total overlap (Hungarian) between the 2D boxes and those of the frames
-    before, moved on at the speed of their edges, among objects of one type whose depths differ by less than half. What
-    finds no partner begins a track; one that is not found for more than two frames ends.
+    Each frame is matched by the assignment of largest total overlap (Hungarian) between its 2D boxes and the boxes of
+    earlier frames, moved at the speed of their edges. Only objects of one type whose depths differ by less than half
+    are matched. An object without a partner begins a track. A track that is not found for more than two frames ends.
 
     Examples:
         >>> from directshape_torch.io.kitti_labels import parse_object

@@ -1,4 +1,4 @@
-"""Points of a LiDAR: KITTI's scans (`velodyne/NNNNNN.bin`) and arrays of points."""
+"""This module reads LiDAR points from KITTI's scans (`velodyne/NNNNNN.bin`) and from arrays."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _NEAREST_M = 1.0
 
 
 def read_scan(path: Path | str, calibration: KittiCalibration) -> Tensor:
-    """All points of a scan (P, 3), float64, metres, in the left camera; its calibration says where the scanner is."""
+    """All points of a scan (P, 3), float64, metres, in the left camera; the calibration gives the scanner's pose."""
     T_cam_lidar = lidar_pose(calibration)
     return torch.from_numpy(read_points(path) @ T_cam_lidar[:3, :3].T + T_cam_lidar[:3, 3])
 
 
 def lidar_pose(calibration: KittiCalibration) -> NDArray[np.float64]:
-    """T_cam_lidar (4, 4): from the scanner (x forward, y left, z up) to the left camera.
+    """T_cam_lidar (4, 4), from the scanner (x forward, y left, z up) to the left camera.
 
     Raises:
-        DataFormatError: the calibration does not say where the scanner is.
+        DataFormatError: the calibration lacks the pose of the scanner.
     """
     if calibration.R0_rect is None or calibration.Tr_velo_to_cam is None:
         missing = "R0_rect" if calibration.R0_rect is None else "Tr_velo_to_cam"
@@ -48,8 +48,8 @@ def lidar_pose(calibration: KittiCalibration) -> NDArray[np.float64]:
 def read_points(path: Path | str) -> NDArray[np.float64]:
     """Points (P, 3), metres, in the frame of the file.
 
-    KITTI's `.bin` is little-endian float32, four a point: x, y, z, reflectance; `.npy` is an array (P, 3 or more).
-    Points whose coordinates are not finite are left out: the scanner has seen nothing there.
+    KITTI's `.bin` is little-endian float32 with four numbers for each point: x, y, z, reflectance. `.npy` is an array
+    (P, 3 or more). Points whose coordinates are not finite are dropped, because the scanner measured nothing there.
     """
     path = Path(path)
     if path.suffix.lower() == ".npy":
@@ -68,7 +68,7 @@ def read_points(path: Path | str) -> NDArray[np.float64]:
 
 
 def points_by_columns(path: Path) -> dict[int, NDArray[np.float32]]:
-    """What the numbers of a `.bin` file are as points (P, 3), by each number of columns that a point could have."""
+    """Points (P, 3) of a `.bin` file for each possible number of columns."""
     content = read_bytes(path)
     counts = [count for count in _POSSIBLE_COLUMNS if content and not len(content) % (4 * count)]
     return {count: np.frombuffer(content, dtype="<f4").reshape(-1, count)[:, :3] for count in counts}
@@ -83,7 +83,7 @@ def _finite(path: Path, points: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def in_image(points_cam: Tensor, size_hw: tuple[int, int], camera: StereoCamera) -> Tensor:
-    """Those of the points (P, 3) that lie in front of the left camera of one frame and fall into its image."""
+    """The points (P, 3) in front of the left camera of one frame that fall into its image."""
     points_cam = points_cam[points_cam[:, 2] > _NEAREST_M]
     uv = project(points_cam, camera.K_left[0].to(points_cam))
     limit = uv.new_tensor([size_hw[1] - 1.0, size_hw[0] - 1.0])
