@@ -1,1 +1,1 @@
-"""Refining whole data sets into a folder of files, with resumption."""
+"""This package refines whole data sets into a folder of files and resumes interrupted runs."""

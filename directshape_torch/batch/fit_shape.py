@@ -1,4 +1,4 @@
-"""Shape and pose of cars from points in their boxes, without images: the point term and the priors alone."""
+"""This module fits shape and pose of cars to points in boxes, without images, by the point term and the priors."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ from directshape_torch.state.cars import CarBatch
 from directshape_torch.status import Status
 from directshape_torch.terms.point_cloud import PointCloud
 
-# Every car is fitted as seen by a camera of its own, which stands 10 m from it and 1.65 m above the ground of its box.
+# Each car is fitted in the frame of its own virtual camera, 10 m from the car and 1.65 m above the ground of its box.
 _CAMERA_HEIGHT_M, _DISTANCE_M = 1.65, 10.0
-# Points this far outside of a box may be the car's, for detectors err; those near the ground are the road's.
+# Points up to this distance outside a box may belong to the car, because detectors err. Points near the ground belong
+# to the road.
 _BEYOND_BOX_M = 0.4
 _LEAST_HEIGHT_M = 0.15
 _LEAST_POINTS, _MOST_POINTS = 30, 1000
@@ -37,15 +38,15 @@ _LEAST_POINTS, _MOST_POINTS = 30, 1000
 
 @dataclass(frozen=True)
 class ShapeFit:
-    """N cars fitted to points.
+    """A `ShapeFit` has N cars fitted to points.
 
     Attributes:
-        cars: poses, codes, boxes and meshes; what is called `cam` there is the frame of the points. The status is
-            `too_few_points` for cars with fewer than 30. Figures of masks are NaN, and standard deviations relative:
-            they are calibrated for images.
-        num_points: (N,) points of each car.
-        distance_before_m, distance_after_m: (N,) mean distance of these points to the surface of the mean car in the
-            given box, and to the fitted one; NaN where there are none.
+        cars: poses, codes, boxes and meshes; `cam` in their names means the frame of the points. The status is
+            `too_few_points` for cars with fewer than 30. Mask figures are NaN. Standard deviations are only relative,
+            because they are calibrated for images.
+        num_points: number of points (N,) of each car.
+        distance_before_m, distance_after_m: mean distance (N,) of these points to the surface of the mean car in the
+            given box, and of the fitted car; NaN for cars without points.
     """
 
     cars: RefinementResult
@@ -54,7 +55,7 @@ class ShapeFit:
     distance_after_m: Tensor
 
     def arrays(self, frame: str, **more: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """For a file: poses `T_FRAME_obj`, codes, points, distances, what else is given, statuses."""
+        """Arrays for a file: poses `T_FRAME_obj`, codes, numbers of points, distances, `more`, statuses."""
         tensors = {
             f"T_{frame}_obj": self.cars.T_cam_obj,
             "codes": self.cars.code,
@@ -76,13 +77,13 @@ def fit_shape(
     """Fit a pose and a shape to the points in each box.
 
     Args:
-        points: of a LiDAR or any other sensor, in the frame of the boxes.
-        boxes: as a detector writes them (`directshape_torch.geometry.box_formats`).
-        convention: of the boxes.
-        prior: the shapes; default the bundled ones.
+        points: points of a LiDAR or any other sensor, in the frame of the boxes.
+        boxes: boxes in the format of a detector (`directshape_torch.geometry.box_formats`).
+        convention: format of the boxes.
+        prior: shape prior. Default: the bundled one.
 
     Raises:
-        InputError: other shapes or types.
+        InputError: points or boxes have another shape or type.
 
     Examples:
         >>> ring = torch.linspace(0, 2 * math.pi, 200)
@@ -93,7 +94,7 @@ def fit_shape(
     """
     points, boxes = as_floating(points), as_floating(boxes)
     check_shape("points", points, ("P", 3), kind="floating")
-    T_points_obj, hwl = boxes_to_poses(boxes, convention, torch.eye(4))  # their frame stands for the camera
+    T_points_obj, hwl = boxes_to_poses(boxes, convention, torch.eye(4))  # their frame takes the place of the camera
     points = points.to(boxes)
     frames, detections = _scene(hwl)
     T_cam_obj = detections.T_cam_obj
@@ -109,7 +110,7 @@ def fit_shape(
     J_points_cam[:, :3, :3] = T_points_cam[:, :3, :3]
     J_points_cam[:, 3, 3] = -1 if is_z_up(convention) else 1
     covariance = J_points_cam @ fitted.covariance_xyz_yaw @ J_points_cam.mT
-    # The masks are invented.
+    # The masks are artificial, so their IoU means nothing.
     quality = replace(fitted.quality, mask_iou_left=torch.full_like(fitted.quality.mask_iou_left, torch.nan))
     cars = replace(fitted, T_cam_obj=kept, covariance_xyz_yaw=covariance, quality=quality)
     return ShapeFit(cars, samples.counts, *distances)
@@ -118,7 +119,7 @@ def fit_shape(
 def _fitter(prior: ShapePrior | None, samples: PointSamples) -> DirectShapeRefiner:
     """A refiner whose terms are the points and the priors."""
     plain = RefinerConfig(compile="off", check="off", rig=RigConfig(0.0))
-    # Images and a detector have no part in the fit.
+    # The fit uses neither images nor a detector.
     config = replace(
         plain,
         silhouette=replace(plain.silhouette, weight=0.0),
@@ -135,7 +136,7 @@ def _fitter(prior: ShapePrior | None, samples: PointSamples) -> DirectShapeRefin
 
 
 def _without_points_unknown(cars: RefinementResult, counts: Tensor, T_cam_obj: Tensor) -> RefinementResult:
-    """Cars with too few points keep their box."""
+    """Cars with too few points keep their boxes."""
     few = counts < _LEAST_POINTS
     status = torch.where(few, Status.too_few_points.code, cars.status_code)
     T = torch.where(few[:, None, None], T_cam_obj, cars.T_cam_obj)
@@ -145,7 +146,7 @@ def _without_points_unknown(cars: RefinementResult, counts: Tensor, T_cam_obj: T
 def _points_of_boxes(
     points: Tensor, T_points_obj: Tensor, T_cam_obj: Tensor, hwl: Tensor
 ) -> tuple[PointSamples, Tensor]:
-    """The points in each box, in the frames (N, 4, 4) of the cameras of the cars."""
+    """The points in each box in camera coordinates of its car, and the transforms (N, 4, 4) to these coordinates."""
     T_cam_points = T_cam_obj @ se3.inverse(T_points_obj)
     height, width, length = (hwl + hwl.new_tensor([_BEYOND_BOX_M, 2 * _BEYOND_BOX_M, 2 * _BEYOND_BOX_M])).T
     car, chosen, counts = [], [], []
@@ -168,14 +169,14 @@ def _points_of_boxes(
 
 
 def _scene(hwl: Tensor) -> tuple[FrameBatch, Detections]:
-    """Cars before a camera that sees nothing."""
+    """Black images and detections of the cars in front of a virtual camera."""
     K = torch.tensor([[32.0, 0.0, 16.0], [0.0, 32.0, 16.0], [0.0, 0.0, 1.0]]).to(hwl)
     black = torch.zeros(3, 32, 32).to(hwl)
     frames = FrameBatch.from_images(black, black, StereoCamera.from_intrinsics(K, 0.5), _CAMERA_HEIGHT_M)
-    # Turned by 45 degrees, for nothing to be degenerate.
+    # Cars are turned by 45 degrees to avoid degenerate views.
     place = hwl.new_tensor([0.0, _CAMERA_HEIGHT_M, _DISTANCE_M, math.pi / 4]).expand(len(hwl), 4)
     boxes = torch.cat([place[:, :3], hwl, place[:, 3:]], dim=1)
-    # Masks of everything: without any, a refiner leaves a car alone.
+    # Masks cover the whole image, because the refiner skips cars without a mask.
     everything = torch.ones(len(hwl), 32, 32, dtype=torch.bool, device=hwl.device)
     return frames, Detections.from_boxes(boxes, "kitti", mask_left=everything)
 

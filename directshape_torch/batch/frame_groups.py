@@ -1,4 +1,4 @@
-"""Which frames are refined together: decided by the data set alone, not by who does the work or what is left of it."""
+"""This module groups the frames that are refined together, in a way that depends only on the data set."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from itertools import groupby
 
 @dataclass(frozen=True)
 class FrameGroup:
-    """Frames of one call of the refiner."""
+    """A `FrameGroup` has the frames of one call of the refiner."""
 
-    frame_ids: tuple[str, ...]  # all of them; the last digits of a result depend on its company
-    # Those whose files are to be written; the others are finished already, or another call writes them.
+    frame_ids: tuple[str, ...]  # all of them; the last digits of a result depend on the other frames
+    # Frames whose files are to be written. The others are finished already, or another call writes them.
     wanted: frozenset[str]
 
     def without(self, finished: Collection[str]) -> FrameGroup:
-        """The same call, with less to write."""
+        """The same group with fewer frames to write."""
         return replace(self, wanted=self.wanted.difference(finished))
 
     def halves(self) -> tuple[FrameGroup, ...]:
-        """Two calls, without one that has nothing to write."""
+        """The halves of the group that have frames to write."""
         middle = (len(self.frame_ids) + 1) // 2
         parts = (self.frame_ids[:middle], self.frame_ids[middle:])
         return tuple(FrameGroup(part, self.wanted.intersection(part)) for part in parts if self.wanted & set(part))
 
 
 def frame_groups(frame_ids: Sequence[str], size: int, finished: Collection[str]) -> list[FrameGroup]:
-    """The calls of a run.
+    """The groups of a run.
 
-    A group of which some frames are finished is refined as a whole again, so that the others get the bytes that they
-    would have got without the interruption.
+    If only some frames of a group are finished, the whole group is refined again, so that the other frames get the same
+    bytes as without the interruption.
 
     Examples:
         >>> [group.frame_ids for group in frame_groups("abcde", 2, finished={"a", "b", "c"})]
@@ -44,9 +44,9 @@ def frame_groups(frame_ids: Sequence[str], size: int, finished: Collection[str])
 def track_windows(
     frame_ids: Sequence[str], sequence_of: Callable[[str], str | None], size: int, finished: Collection[str]
 ) -> list[FrameGroup]:
-    """The calls of a run with tracks: each sequence whole, or in windows that overlap by half.
+    """The groups of a run with tracks: whole sequences, or windows of a sequence that overlap by half.
 
-    A frame is written by the window in whose middle it is most. What is finished changes nothing in the others.
+    A frame is written by the window whose middle is nearest. Finished frames do not change the results of others.
 
     Examples:
         >>> windows = track_windows("abcdef", lambda _: "", 4, finished={"e"})

@@ -1,4 +1,4 @@
-"""All files of one refined frame, and what its last one says of the others."""
+"""This module writes all files of one refined frame; the last file contains the hashes of the others."""
 
 from __future__ import annotations
 
@@ -54,10 +54,10 @@ def write_frame_outputs(
     inputs: Mapping[str, str],
     options: RefineOptions,
 ) -> FrameEntry:
-    """Write what the options ask for; the shapes come last, so that where they exist the frame is complete.
+    """Write the files that the options ask for; shapes come last, so that their existence marks a complete frame.
 
     `run`, `prior_sha256` and `inputs` are hashes of the manifest, of the shape prior and of the frame's input files.
-    Returns the frame's entry in `summary.json`.
+    The result is the frame's entry in `summary.json`.
     """
     path = shapes_path(out_dir, loaded.frame_id)
     earlier = _earlier_record(path, run, inputs)
@@ -74,7 +74,7 @@ def write_frame_outputs(
     write_result_text(files[0], loaded.input_objects, refined_boxes(boxes, result.refined, loaded.row_of_detection))
     hashes = {file.relative_to(out_dir).as_posix(): hash_bytes(file.read_bytes()) for file in files}
     outputs, masks_right = set(options.outputs), int(loaded.detections.has_mask_right.sum())
-    # Those of an earlier run stay.
+    # Files of an earlier run with the same inputs are kept.
     if earlier is not None:
         hashes, outputs = {**earlier.files, **hashes}, outputs.union(earlier.outputs)
     record = FrameRecord(run, inputs, sorted(outputs), hashes, len(loaded.input_objects), masks_right)
@@ -83,7 +83,7 @@ def write_frame_outputs(
 
 
 def _earlier_record(path: Path, run: str, inputs: Mapping[str, str]) -> FrameRecord | None:
-    """Of files that were made of the same."""
+    """The record of earlier files if they were made by the same run from the same inputs, else None."""
     with suppress(DataFormatError):
         record = read_record(path, read_shapes(path))
         return record if (record.run, record.inputs) == (run, inputs) else None
@@ -93,9 +93,9 @@ def _earlier_record(path: Path, run: str, inputs: Mapping[str, str]) -> FrameRec
 def write_meshes(
     out_dir: Path | str, frame_id: str, lines: Sequence[KittiObject], result: RefinementResult, mesh_format: MeshFormat
 ) -> list[Path]:
-    """The surface of each refined car of a frame in the left camera frame, metres; returns the files.
+    """Write the surface of each refined car in the left camera frame, metres, and return the files.
 
-    GLB files hold the same vertices as PLY files below a node that turns them into glTF's axes (y up).
+    GLB files have the vertices of PLY files below a node that rotates them to glTF's axes (y up).
     """
     paths, refined = [], result.refined.tolist()
     for car, line in enumerate(lines):
@@ -106,7 +106,7 @@ def write_meshes(
 
 
 def refined_boxes(boxes: KittiBoxes, refined: Tensor, rows: Sequence[int]) -> dict[int, RefinedBox]:
-    """The new box of each refined car, by its row of the input; all other rows keep their line."""
+    """The new box of each refined car, by its input row; rows without a box keep their line."""
     hwl, location, yaw = (each.double().cpu() for each in (boxes.dimensions_hwl, boxes.location_ref, boxes.rotation_y))
     columns = torch.cat([alpha_from_kitti(location, yaw)[:, None], hwl, location, yaw[:, None]], dim=1).tolist()
     return {row: columns[car] for car, row in enumerate(rows) if refined[car]}
@@ -125,7 +125,7 @@ def _mesh_bytes(mesh: trimesh.Trimesh, mesh_format: MeshFormat) -> bytes:
 
 
 def _shape_arrays(loaded: LoadedFrame, result: RefinementResult, boxes: KittiBoxes, prior_sha256: str) -> ShapeArrays:
-    """What `shapes/NNNNNN.npz` holds, but for its record."""
+    """The content of `shapes/NNNNNN.npz` without its record."""
     lines = [loaded.input_objects[row].line_number for row in loaded.row_of_detection]
     return ShapeArrays(
         frame_id=loaded.frame_id,
@@ -167,7 +167,7 @@ def _shape_arrays(loaded: LoadedFrame, result: RefinementResult, boxes: KittiBox
 
 
 def _messages(loaded: LoadedFrame, result: RefinementResult) -> tuple[str, ...]:
-    """What each car's status says; where its mask was looked for among those of a frame, why it has none."""
+    """The status text of each car, or the reason why it has no mask."""
     reasons = loaded.no_mask_reasons or ("",) * len(result)
     return tuple(
         reason if reason and status is Status.no_mask else status.value

@@ -1,4 +1,4 @@
-"""The work itself, the same in every process: read a group of frames, refine it, write its files."""
+"""This module reads a group of frames, refines it and writes its files, in the same way in every process."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 
-# What is true of every frame: going on would only fail them one after another.
+# These errors affect every frame, so further frames would only fail too.
 STOPS_THE_RUN = (CompilationError, MissingDependencyError, OutputLostError)
 
 
 @dataclass(frozen=True)
 class RunJob:
-    """All that a process needs for its share of a run."""
+    """A `RunJob` has everything that a process needs for its part of a run."""
 
     dataset: StereoDataset
     refiner: DirectShapeRefiner
@@ -39,26 +39,26 @@ class RunJob:
     # Hashes of the manifest and of the shape prior.
     run: str
     prior_sha256: str
-    # About how many the whole run has, from which every process draws the same conclusion whether to compile.
+    # Estimated number of cars of the whole run, so that every process decides alike whether to compile.
     expected_cars: int
 
 
 @dataclass
 class GroupReport:
-    """What became of a group."""
+    """A `GroupReport` says how the frames of a group ended."""
 
-    ends: dict[str, FrameEntry]  # what `summary.json` says of its frames, in the order in which they ended
-    timings: RunTimings = field(default_factory=RunTimings)  # of its calls and of this process so far
-    num_halved: int = 0  # calls that did not work and were tried again with half of the frames
+    ends: dict[str, FrameEntry]  # entries of `summary.json`, in the order in which frames ended
+    timings: RunTimings = field(default_factory=RunTimings)  # times of the calls, and resources of this process so far
+    num_halved: int = 0  # calls that failed and were repeated with half of the frames
     stopped: str | None = None  # why no other frame could be refined either, or None
 
 
-# A frame that was read, with the hashes of its files.
+# A loaded frame comes with the hashes of its files.
 _Ready = tuple[LoadedFrame, dict[str, str]]
 
 
 def refine_group(job: RunJob, group: FrameGroup) -> GroupReport:
-    """Refine a group in this process; errors of a frame are in its end, those of the whole run in `stopped`."""
+    """Refine a group in this process; errors of a frame go to `ends`, errors of the whole run to `stopped`."""
     step, cpu_start_s = _GroupStep(job, group), time.process_time()
     try:
         step.refine(group.frame_ids)
@@ -71,21 +71,21 @@ def refine_group(job: RunJob, group: FrameGroup) -> GroupReport:
 
 
 class _GroupStep:
-    """One group on its way."""
+    """A `_GroupStep` is the refinement of one group."""
 
     def __init__(self, job: RunJob, group: FrameGroup) -> None:
         self.job, self.group = job, group
         self.report = GroupReport({}, RunTimings(job.refiner.prior.origin.device))
 
     def refine(self, frame_ids: Sequence[str]) -> None:
-        """Together, or by halves where that does not work, down to the frame that is the cause."""
+        """Refine frames together, or in halves after a failure, down to the single frame that is the cause."""
         frame_ids = [frame_id for frame_id in frame_ids if frame_id not in self.report.ends]
         if self.group.wanted.isdisjoint(frame_ids):
             return
         problem = self._attempt(frame_ids)
         if problem is None:
             return
-        # Only now, when the traceback and with it the tensors of the call are gone.
+        # Memory is freed only here, because the traceback holds the tensors of the call until then.
         gc.collect()
         torch.cuda.empty_cache()
         if len(frame_ids) == 1:
@@ -96,14 +96,14 @@ class _GroupStep:
             self.refine(half.frame_ids)
 
     def _attempt(self, frame_ids: Sequence[str]) -> str | None:
-        """Why these frames cannot be refined together, or None where each of them has ended."""
+        """Refine frames together; return why they cannot be, or None if each of them has ended."""
         try:
             batch = [ready for ready in map(self._read, frame_ids) if ready is not None]
             parts = [[batch[k] for k in part] for part in split_by_rig([loaded for loaded, _ in batch])]
             results = [self._call([loaded for loaded, _ in part]) for part in parts]
         except STOPS_THE_RUN:
             raise
-        # Whatever a frame of a hundred thousand brings to light: it is reported, and the others go on.
+        # Any error of one frame among many is reported, and the other frames go on.
         except Exception as error:
             return _with_memory_advice(error, len(frame_ids))
         for part, result in zip(parts, results, strict=True):
@@ -129,7 +129,7 @@ class _GroupStep:
         prior = self.job.refiner.prior.origin
         frames, detections = collate(batch)
         frames, detections = frames.to(prior.device, prior.dtype), detections.to(prior.device, prior.dtype)
-        # Said anew before each call, so that it does not matter which calls this process had before.
+        # The number is set again before each call, so that earlier calls of this process do not matter.
         with cars_ahead(self.job.expected_cars), self.report.timings.measure(frames.frame_ids, len(detections)):
             result: RefinementResult = self.job.refiner(frames, detections)
         return result
@@ -146,14 +146,14 @@ class _GroupStep:
             self._fail(loaded.frame_id, _reason(error))
 
     def _fail(self, frame_id: str, reason: str) -> None:
-        # A finished frame that was only to keep the others company stays finished.
+        # A frame that was finished before and only joined the group again stays finished.
         if frame_id in self.group.wanted:
             self.report.ends[frame_id] = failed_entry(reason)
 
 
 @contextmanager
 def limited_threads(threads: int | None) -> Iterator[None]:
-    """That number of threads of PyTorch and OpenCV while the body runs; None leaves them."""
+    """Set the number of threads of PyTorch and OpenCV while the body runs; None leaves it unchanged."""
     import cv2
 
     before = torch.get_num_threads(), cv2.getNumThreads()
@@ -174,7 +174,7 @@ def _reason(error: Exception) -> str:
 
 
 def _with_memory_advice(error: Exception, num_frames: int) -> str:
-    # On the CPU PyTorch and OpenCV have no class of exception for it.
+    # On the CPU, PyTorch and OpenCV have no exception class for lack of memory.
     signs = ("can't allocate memory", "Insufficient memory", "CUDA out of memory")
     if not isinstance(error, (MemoryError, torch.OutOfMemoryError)) and not any(sign in str(error) for sign in signs):
         return _reason(error)

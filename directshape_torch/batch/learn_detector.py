@@ -1,4 +1,4 @@
-"""What a run's detector is off by, from refinements of some of its frames (`RigEstimate.learn`)."""
+"""This module learns the errors of a run's detector from refinements of some frames (`RigEstimate.learn`)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.from_files import evenly
 from directshape_torch.rig.rigs import RigEstimates
 
-# Standard deviations of so many differences are known to 7 %.
+# With this many differences, standard deviations are accurate to 7 %.
 _ENOUGH_RESULTS = 100
 _MOST_FRAMES = 60
 _EVERY_RESULT = AcceptanceConfig(min_probability_better=0.0, min_probability_not_worse=0.0)
@@ -26,10 +26,10 @@ def learn_detector(
     rigs: RigEstimates,
     tell: Callable[[str], object] = lambda _: None,
 ) -> None:
-    """Refine frames until the rigs know what the detector is off by, and let them learn from every result.
+    """Refine frames until the rigs know the errors of the detector, and let them learn from every result.
 
-    Frames are taken evenly from all of the data set, whichever of them are chosen, at most 60. What cannot be read is
-    passed over: it is reported when its turn comes. `tell` gets the name of each frame.
+    At most 60 frames are taken evenly from the whole data set, whether chosen or not. Frames that cannot be read are
+    skipped here and reported when they are refined. `tell` gets the name of each frame.
     """
     config = replace(refiner.config, acceptance=_EVERY_RESULT, check="off")
     alone = DirectShapeRefiner(refiner.prior, config, refiner.extra_terms, rigs)
@@ -45,7 +45,7 @@ def learn_detector(
                 rigs.learn(frames, alone(frames, detections))
         except STOPS_THE_RUN:
             raise
-        # Whatever a frame brings to light, too little memory too, is told when its turn comes.
+        # Any error of a frame, also lack of memory, is reported when the frame is refined.
         except Exception:
             continue
         tell(frame_id)

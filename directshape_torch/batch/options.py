@@ -1,4 +1,4 @@
-"""What a run over a data set is asked for besides the refinement itself, and who is told of it."""
+"""This module has the options of a run over a data set, and the observer that is told of its progress."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ MeshFormat = Literal["ply", "glb"]
 
 @dataclass(frozen=True)
 class RefineOptions:
-    """Outputs of `refine_dataset`, and who does the work.
+    """A `RefineOptions` has the outputs of `refine_dataset` and its processes.
 
     Attributes:
-        meshes: write the surface of each refined car as "ply" or "glb"; None writes none.
-        overlays: write a picture of each frame, before and after.
-        batch_frames: frames refined together in one call.
-        workers: processes that refine side by side. None: this process alone.
-        threads: of each of them. None: this process keeps what it has, a worker gets 1.
+        meshes: format of the surface of each refined car, "ply" or "glb"; None writes none.
+        overlays: whether to write a picture of each frame, before and after.
+        batch_frames: number of frames refined together in one call.
+        workers: number of parallel processes. None: only this process.
+        threads: number of threads of each process. None: this process keeps its number, and a worker gets 1.
         retries: how often frames whose worker died are tried again before they count as failed.
 
     Raises:
@@ -56,15 +56,15 @@ class RefineOptions:
 
     @property
     def threads_per_worker(self) -> int | None:
-        """The number to set, or None to leave it."""
+        """The number of threads to set, or None to leave it unchanged."""
         return 1 if self.workers is not None and self.threads is None else self.threads
 
 
 class RunObserver:
-    """Is told how a run comes along, as a progress bar is; this one says nothing."""
+    """A `RunObserver` is told of the progress of a run, for example to show it; this class ignores it."""
 
     def started(self, frame_ids: Sequence[str]) -> None:
-        """The frames that are about to be refined; finished ones of an earlier run are not among them."""
+        """Called before refinement with all frames to refine, without finished frames of an earlier run."""
 
     def finished(self, frame_id: str, failure: str | None) -> None:
-        """A frame is done, or failed for the given reason."""
+        """Called when a frame is done, or has failed for the given reason."""

@@ -1,4 +1,4 @@
-"""`refine_dataset`: every frame of a data set refined into a folder, one bad frame not stopping the others."""
+"""`refine_dataset` refines every frame of a data set into a folder; a frame that fails does not stop the others."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
 
-# Detection files that tell how many cars are ahead.
+# The number of cars is estimated from this many detection files.
 _FRAMES_COUNTED = 50
 
 
@@ -44,23 +44,24 @@ def refine_dataset(
 ) -> RunSummary:
     """Refine all frames of a data set and write the results (docs/file_formats.md, docs/run_on_everything.md).
 
-    A second call continues where the first stopped, however it stopped. Frames that cannot be read or refined are
-    reported and do not stop the others; they are tried again by the next call. The results are the same byte for byte
-    whoever does the work, with the same number of threads and frames in a call.
+    A second call continues an interrupted first call. Frames that cannot be read or refined are reported and do not
+    stop the others; the next call tries them again. With the same number of threads and of frames in a call, results
+    are the same byte for byte in all processes.
 
     Args:
         dataset: the frames, in the dtype of the refiner.
-        refiner: on any device.
-        out_dir: gets `data`, `shapes`, `summary.json`, `run.jsonl`, `timings.json` and what the options ask for.
-        options: kinds of outputs, frames in a call, other processes; default this process.
-        observer: is told of each frame.
-        fresh: remove what earlier runs have written there and start again.
+        refiner: refiner on any device.
+        out_dir: folder of `data`, `shapes`, `summary.json`, `run.jsonl`, `timings.json` and the files that the options
+            ask for.
+        options: kinds of outputs, frames in a call, number of processes. Default: this process only.
+        observer: observer that is told of each frame.
+        fresh: whether to remove files of earlier runs and start again.
 
     Raises:
-        ResumeError: the folder holds results of another configuration, prior or input.
-        RunInProgressError: another run is writing there.
-        InputError: `out_dir` is no folder or would overwrite the detections, or a folder in it is a link.
-        DirectShapeError: the run cannot go on: the disk is full, workers die before they finish anything.
+        ResumeError: the folder has results of another configuration, prior or input.
+        RunInProgressError: another run writes to the folder.
+        InputError: `out_dir` is not a folder or would overwrite the detections, or a folder in it is a link.
+        DirectShapeError: the run cannot continue, because the disk is full or workers die before they finish a frame.
     """
     out_dir, options = Path(out_dir), options or RefineOptions()
     check_out_dir(dataset, out_dir)
@@ -69,14 +70,14 @@ def refine_dataset(
         is_cleared = fresh and remove_results(out_dir)
         manifest = run_manifest(dataset, refiner, options.batch_frames)
         earlier = EarlierResults(out_dir, manifest, options.outputs, is_cleared)
-        # Of all frames, also of those that are finished: after an interruption the decision must be the same.
+        # All frames count, also finished ones, because a resumed run must make the same decision.
         num_cars = expected_cars(dataset, dataset.frame_ids)
         job = RunJob(dataset, refiner, out_dir, options, manifest.hash, manifest.sha256["prior"], num_cars)
         return _Run(job, earlier, log, observer or RunObserver()).execute()
 
 
 class _Run:
-    """One run, as the process that was started by the user sees it."""
+    """A `_Run` is one run in the process that the user started."""
 
     def __init__(self, job: RunJob, earlier: EarlierResults, log: RunLog, observer: RunObserver) -> None:
         self.job, self.earlier, self.log, self.observer = job, earlier, log, observer
@@ -100,9 +101,9 @@ class _Run:
             if groups:
                 self._refine(groups)
         except BaseException as error:
-            # What is finished stays finished. On a full disk even this fails, and the files tell the next run.
+            # Finished frames stay finished. On a full disk even this fails, and the next run reads the files.
             with contextlib.suppress(OSError, DirectShapeError):
-                # Workers have ended the frames that they had, and nobody heard of it.
+                # Workers may have finished frames that were not reported.
                 self.earlier.take_in(set(done_frames(self.out_dir)).intersection(self.dataset.frame_ids))
                 self._end(resumed, str(error) or type(error).__name__)
             raise
@@ -143,7 +144,7 @@ class _Run:
             raise DirectShapeError(report.stopped)
 
     def _end(self, resumed: Sequence[str], reason: str | None) -> RunSummary:
-        """Write what is known at the end of the run, whatever end that is."""
+        """Write the final state of the run, for every kind of end."""
         if self.timings.calls:
             write_timings(self.out_dir, self.timings)
         self.earlier.write()
@@ -159,7 +160,7 @@ class _Run:
             self.warnings.append(f"tracks seem to be of two cars, and were split (docs/tracks.md): {_some(split)}")
 
     def _look_for_files(self) -> None:
-        """Every frame must have come to an end; one without files has failed."""
+        """Mark frames without files as failed, since every frame must have ended."""
         paths = [result_path, shapes_path, *([overlay_path] if self.options.overlays else [])]
         failed = self.earlier.manifest.failed
         for frame_id in self.dataset.frame_ids:
@@ -198,11 +199,11 @@ def _some(names: Sequence[str]) -> str:
 
 
 def expected_cars(dataset: StereoDataset, frame_ids: Sequence[str]) -> int:
-    """About how many cars frames have, from the detection files of some of them: whether compiling will pay."""
+    """Estimated number of cars in frames, from some detection files; it decides whether compiling is worthwhile."""
     looked_at = frame_ids[:: max(1, len(frame_ids) // _FRAMES_COUNTED)]
     count = 0
     for frame_id in looked_at:
-        # A file that cannot be read is reported when its turn comes.
+        # A file that cannot be read is reported when its frame is refined.
         with contextlib.suppress(DirectShapeError, OSError):
             objects = dataset.objects(frame_id)
             count += sum(found.type in dataset.classes for found in objects)
@@ -210,14 +211,14 @@ def expected_cars(dataset: StereoDataset, frame_ids: Sequence[str]) -> int:
 
 
 def has_tracks(dataset: StereoDataset) -> bool:
-    """Whether its cars are numbered over the frames of sequences."""
+    """Whether the data set numbers its cars over the frames of sequences."""
     return dataset.sequence_of(dataset.frame_ids[0]) is not None
 
 
 def run_manifest(dataset: StereoDataset, refiner: DirectShapeRefiner, batch_frames: int = 1) -> RunManifest:
-    """What the results of a run depend on, besides the files of each frame.
+    """All settings and files that results depend on, apart from the files of each frame.
 
-    Device, kinds of outputs and, without tracks, batch size are left out: they do not change what is computed.
+    Device, kinds of outputs and, without tracks, batch size are excluded, because they do not change the computation.
     """
     settings: dict[str, Any] = {
         "refiner": config_to_mapping(refiner.config),
@@ -237,7 +238,7 @@ def run_manifest(dataset: StereoDataset, refiner: DirectShapeRefiner, batch_fram
 
 
 def _described(make: TermFactory) -> str:
-    """A factory of terms in words that stay: a function by its name, anything else as it prints itself."""
+    """A factory of terms in stable words: the name of a function, or the `repr` of anything else."""
     name = getattr(make, "__qualname__", None)
     return repr(make) if name is None else f"{make.__module__}.{name}"
 
@@ -251,7 +252,7 @@ def package_version() -> str:
 
 
 def check_out_dir(dataset: StereoDataset, out_dir: Path) -> None:
-    """Raise `InputError` where it is no folder or would overwrite the detections, or a folder in it is a link."""
+    """Raise `InputError` if it is not a folder or would overwrite the detections, or a folder in it is a link."""
     check_folder("out", out_dir)
     for link in (out_dir / name for name in OUTPUT_FOLDERS if (out_dir / name).is_symlink()):
         cure = "remove the link; the output folder itself may be one"

@@ -1,4 +1,4 @@
-"""What earlier runs have left in an output folder: which frames need no work, and what must go."""
+"""This module reads what earlier runs left in an output folder, and decides which frames need no work."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from directshape_torch.io.run_manifest import (
 from directshape_torch.io.stereo_dataset import StereoDataset
 
 _Found = TypeVar("_Found")
-# Hashing waits for the disk most of the time, and for a network's even longer.
+# Hashing mostly waits for the disk or the network, so several threads read at a time.
 _READING_THREADS = 8
 _MESH = re.compile(r"(.+)_[0-9]{1,9}\.(ply|glb)")
 _TRACK = re.compile(r"(.+_)?[0-9]{6,}\.npz")
@@ -45,11 +45,11 @@ OUTPUT_FOLDERS = ("data", "shapes", "meshes", "overlays", "tracks")
 
 
 class EarlierResults:
-    """The results of earlier runs, which this one goes on with; raises `ResumeError` where it cannot.
+    """An `EarlierResults` has the results of earlier runs, which a run continues; else `ResumeError` is raised.
 
     Attributes:
-        manifest: with the frames of earlier runs.
-        remade: frames whose files have been removed or damaged since they were finished, after `finished_frames`.
+        manifest: manifest that includes the frames of earlier runs.
+        remade: frames whose files were removed or damaged after they were finished; set by `finished_frames`.
     """
 
     def __init__(self, out_dir: Path, manifest: RunManifest, outputs: Sequence[str], is_cleared: bool = False) -> None:
@@ -65,15 +65,15 @@ class EarlierResults:
         self.write()
 
     def finished_frames(self, dataset: StereoDataset) -> list[str]:
-        """Frames of the data set that need no work: done, with all the outputs whole, from the files as they are now.
+        """Frames of the data set that need no work, because all outputs are complete and belong to the current inputs.
 
         Raises:
-            ResumeError: the files of a finished frame have changed since, or are gone.
+            ResumeError: the input files of a finished frame have changed or are missing.
         """
         frames, done = self.manifest.frames, set(done_frames(self.out_dir))
         known = [f for f in dataset.frame_ids if f in done or (f in frames and frames[f]["state"] == "done")]
         checked = _in_threads(partial(self._checked, dataset), known)
-        # Of frames that nobody asks for now the summary tells all the same.
+        # The summary also keeps finished frames that are not chosen now.
         self.take_in(done.difference(dataset.frame_ids))
         found = {frame_id: entry for frame_id, (entry, _) in checked.items() if entry is not None}
         self.remade = [frame_id for frame_id, (_, is_damaged) in checked.items() if is_damaged]
@@ -85,14 +85,14 @@ class EarlierResults:
         return list(found)
 
     def take_in(self, frame_ids: Iterable[str]) -> None:
-        """Let the summary tell of frames that are done, which nobody has noted."""
+        """Add finished frames to the summary that are not recorded there."""
         frames = self.manifest.frames
         unknown = sorted(f for f in frame_ids if f not in frames or frames[f]["state"] == "failed")
         entries = _in_threads(self.entry, unknown)
         frames.update({frame_id: entry for frame_id, entry in entries.items() if entry is not None})
 
     def entry(self, frame_id: str) -> FrameEntry | None:
-        """That of a frame which has all outputs of this run, and nobody has removed or changed them since."""
+        """The entry of a frame that has all outputs of this run, unchanged, else None."""
         with suppress(DataFormatError):
             return frame_entry(*read_done(self.out_dir, frame_id, self.manifest.hash, self.outputs))
         return None
@@ -102,7 +102,7 @@ class EarlierResults:
         write_manifest(summary_path(self.out_dir), self.manifest)
 
     def _checked(self, dataset: StereoDataset, frame_id: str) -> tuple[FrameEntry | None, bool]:
-        """The entry of a frame that is finished, and whether one that is not has lost something."""
+        """The entry of a finished frame, or None, and whether an unfinished frame has lost files."""
         try:
             path = shapes_path(self.out_dir, frame_id)
             record = read_record(path, read_shapes(path))
@@ -134,14 +134,14 @@ def _in_threads(read: Callable[[str], _Found], frame_ids: Sequence[str]) -> dict
 
 
 def remove_unfinished_files(out_dir: Path) -> None:
-    """Remove temporary files of processes that were killed while they wrote; only for who holds the folder."""
+    """Remove temporary files of killed processes; the caller must hold the folder's lock."""
     for folder in (out_dir, *(out_dir / name for name in OUTPUT_FOLDERS)):
         for path in folder.glob(".*.tmp"):
             path.unlink(missing_ok=True)
 
 
 def remove_results(out_dir: Path) -> bool:
-    """Remove what runs have written into a folder, and nothing else; without a summary, and False, nothing."""
+    """Remove the files that runs have written, and no others; without a summary remove nothing and return False."""
     previous = read_manifest(summary_path(out_dir))
     if previous is None:
         return False
@@ -158,6 +158,6 @@ def remove_results(out_dir: Path) -> bool:
     for path in (out_dir / TIMINGS, summary_path(out_dir)):
         path.unlink(missing_ok=True)
     for name in OUTPUT_FOLDERS:
-        with suppress(OSError):  # files of somebody else stay, and their folder with them
+        with suppress(OSError):  # files of other origin stay, and so does their folder
             (out_dir / name).rmdir()
     return True

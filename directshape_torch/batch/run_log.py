@@ -1,7 +1,7 @@
-"""`run.jsonl`: who runs in an output folder and what has ended so far. The results do not need it.
+"""This module keeps `run.jsonl`, the log of the run in an output folder; results do not depend on it.
 
-The run that goes on there holds the file locked, so that there is one at a time, and appends a line of JSON for each
-thing that happens. A line that was cut short (a killed process, a full disk) counts for nothing.
+The active run locks the file, so that only one run writes at a time, and appends a line of JSON for each event. A line
+that was cut short (by a killed process or a full disk) is ignored.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from directshape_torch.files.schema import record_of
 
 try:
     import fcntl
-except ImportError:  # only Unix has it; elsewhere nothing is locked, but the owner is named
+except ImportError:  # only Unix has it; elsewhere there is no lock, but the owner is named
     fcntl = None  # type: ignore[assignment]
 
 LOG_SCHEMA_VERSION = 1
 _BEGINNING = b'{"schema": "directshape run", '
-# Not every system has them.
+# Some systems lack these flags.
 _LOCK_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 _DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 _PACKAGES = ("directshape_torch", "torch", "numpy", "opencv-python-headless", "scipy")
-# What the last digits of a result depend on.
+# The last digits of a result depend on these settings.
 _DIGITS = ("threads", "batch_frames", "device")
 
 
 class OutputLostError(DirectShapeError):
-    """The output folder takes nothing more."""
+    """No more results can be written to the output folder."""
 
 
 @contextmanager
 def writing_to(out_dir: Path) -> Iterator[None]:
-    """Tells of a full disk in the body by an `OutputLostError`."""
+    """Raise `OutputLostError` if the disk is full while the body runs."""
     try:
         yield
     except OSError as error:
@@ -66,57 +66,57 @@ def _versions() -> dict[str, str]:
 
 @dataclass(frozen=True)
 class RunBeginning:
-    """The first line."""
+    """A `RunBeginning` is the first line of the log."""
 
-    # Who works: "where" ("this process" or "processes"), "workers", "threads" of each, "device", "batch_frames",
+    # Keys are "where" ("this process" or "processes"), "workers", "threads" of each, "device", "batch_frames" and
     # "outputs".
     work: Mapping[str, Any]
-    num_frames: int  # of the data set
-    # The process that was started by the user.
+    num_frames: int  # number of frames of the data set
+    # The process that the user started.
     host: str = field(default_factory=platform.node)
     pid: int = field(default_factory=os.getpid)
-    started_at: float = field(default_factory=time.time)  # seconds since 1970, like all times
+    started_at: float = field(default_factory=time.time)  # seconds since 1970, as for all times
     versions: Mapping[str, str] = field(default_factory=_versions)  # of Python and of the packages that compute
 
     @property
     def is_alive(self) -> bool | None:
-        """Whether the process runs; None where it is on another machine."""
+        """Whether the process runs; None if it is on another machine."""
         if self.host != platform.node():
             return None
         try:
             os.kill(self.pid, 0)
-        except (ProcessLookupError, OverflowError):  # no process has such a number
+        except (ProcessLookupError, OverflowError):  # no process has this number
             return False
-        except PermissionError:  # it runs, but is somebody else's
+        except PermissionError:  # it runs, but belongs to another user
             return True
         return True
 
     @property
     def owner(self) -> str:
-        """In words."""
+        """The process and its start in words."""
         since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.started_at))
         return f"process {self.pid} on {self.host}, since {since}"
 
 
 @dataclass(frozen=True)
 class RunEvent:
-    """A later line: a frame has ended, what earlier runs left has been checked, or the run has ended."""
+    """A `RunEvent` is a later line: a frame has ended, earlier results have been checked, or the run has ended."""
 
     at: float
     frame: str | None = None
     failure: str | None = None  # why the frame is not done
-    resumed: int | None = None  # frames that earlier runs had done
+    resumed: int | None = None  # number of frames that earlier runs had done
     end: Literal["finished", "stopped"] | None = None
-    # Of the end: frames that are done, why others are not, and why the run was stopped.
+    # These are set at the end: frames that are done, why others are not, and why the run was stopped.
     done: int = 0
     failed: Mapping[str, str] = field(default_factory=dict)
     reason: str | None = None
 
 
 class RunLog:
-    """Holds a folder while the body runs; the operating system lets go of it however the process ends.
+    """A `RunLog` locks a folder while the body runs; the operating system releases the lock when the process ends.
 
-    Raises `RunInProgressError` where another process holds it.
+    It raises `RunInProgressError` if another process holds the lock.
     """
 
     def __init__(self, out_dir: Path) -> None:
@@ -125,7 +125,7 @@ class RunLog:
 
     def __enter__(self) -> Self:
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        # A link is no lock: it would empty what it leads to.
+        # A link is refused, because its target would be emptied.
         try:
             file = open(self.path, "a+b", buffering=0, opener=_opened)
         except OSError as error:
@@ -153,25 +153,25 @@ class RunLog:
         file, self._file = self._file, None
         assert file is not None, "the folder is held"
         with file, suppress(OSError):
-            # A run that never began leaves no log. Removed before it is let go of, so that nobody locks a file that is
-            # about to vanish; of a moved folder it may be another run's by now.
+            # A run that did not begin leaves no log. The file is removed before its lock is released, so that no
+            # process locks a file that is about to vanish. In a moved folder the path may belong to another run by now.
             if not os.fstat(file.fileno()).st_size and self._is_at_its_place(file):
                 self.path.unlink()
 
     def begin(self, beginning: RunBeginning) -> None:
-        """Forget the run before and write the first line."""
+        """Remove the log of the previous run and write the first line."""
         assert self._file is not None, "the folder is held"
         self._file.truncate(0)
         start = json.loads(_BEGINNING.rstrip(b", ") + b"}")
         self._append({**start, "schema_version": LOG_SCHEMA_VERSION, **asdict(beginning)})
 
     def add(self, event: RunEvent) -> None:
-        """Write a later line: what is known of it."""
+        """Write a later line with the known values of an event."""
         nothing = asdict(RunEvent(event.at))
         self._append({k: value for k, value in asdict(event).items() if k == "at" or value != nothing[k]})
 
     def _append(self, content: Mapping[str, Any]) -> None:
-        """All of a line or, where that fails, nothing."""
+        """Append a complete line, or nothing if writing fails."""
         file = self._file
         assert file is not None, "the folder is held"
         length = os.fstat(file.fileno()).st_size
@@ -185,7 +185,7 @@ class RunLog:
                 raise
 
     def _is_at_its_place(self, file: IO[bytes]) -> bool:
-        """Whether the path still leads to the file that is held."""
+        """Whether the path still leads to the locked file."""
         return os.path.samestat(os.fstat(file.fileno()), self.path.stat())
 
     def _owner(self) -> str:
@@ -204,12 +204,12 @@ def _opened(path: str, flags: int) -> int:
 
 
 def log_path(out_dir: Path) -> Path:
-    """The file of an output folder."""
+    """The log file of an output folder."""
     return out_dir / "run.jsonl"
 
 
 def read_log(out_dir: Path) -> tuple[RunBeginning, list[RunEvent]] | None:
-    """What the log says of the latest run into a folder, also while it goes on; None where none has begun."""
+    """The log of the latest run into a folder, also of a running one; None if no run has begun."""
     path, cure = log_path(out_dir), "remove it; results do not need it"
     if not path.is_file():
         return None
@@ -230,7 +230,7 @@ def read_log(out_dir: Path) -> tuple[RunBeginning, list[RunEvent]] | None:
 
 
 def digit_warnings(before: RunBeginning, now: RunBeginning) -> list[str]:
-    """What differs from the previous run so that the last digits of further results may differ too.
+    """Warnings about differences from the previous run that may change the last digits of further results.
 
     Examples:
         >>> digit_warnings(RunBeginning({"threads": 1}, 5), RunBeginning({"threads": 2}, 5))

@@ -1,4 +1,4 @@
-"""How far a run is, while it goes on or after it was cut off: reads its log and changes nothing."""
+"""This module reads the progress of a run from its log, during the run or after its end, and changes nothing."""
 
 from __future__ import annotations
 
@@ -10,40 +10,40 @@ from pathlib import Path
 from directshape_torch.batch.run_log import read_log
 from directshape_torch.errors import DataFormatError
 
-# Frames of which the rate is: enough for a mean, few enough to follow a change of load.
+# The rate is measured over this many frames: enough for a mean, few enough to follow a change of load.
 _RECENT_FRAMES = 200
 _SHOWN_FAILURES = 10
 
 
 @dataclass(frozen=True)
 class RunStatus:
-    """The latest run into a folder."""
+    """A `RunStatus` describes the latest run into a folder."""
 
-    state: str  # "checking", "running", "finished", "stopped", or "killed": the run ended without saying so
-    owner: str | None  # the process that runs, in words, or None
-    work: Mapping[str, object]  # who works, see `RunBeginning`
+    state: str  # "checking", "running", "finished", "stopped", or "killed" if the run ended without an entry in its log
+    owner: str | None  # the running process in words, or None
+    work: Mapping[str, object]  # processes and threads, see `RunBeginning`
     num_frames: int  # of the data set
-    num_done: int  # frames done, those of earlier runs included
-    num_resumed: int  # these
+    num_done: int  # frames done, including frames of earlier runs
+    num_resumed: int  # frames done by earlier runs
     failed: Mapping[str, str]  # frames that failed, with the reason
-    frames_per_s: float | None  # at present, or None where too few have ended
-    seconds_left: float | None  # at this rate, or None where nobody knows
-    last_frame_at: float | None  # when a frame last ended, seconds since 1970, or None
+    frames_per_s: float | None  # current rate, or None if too few frames have ended
+    seconds_left: float | None  # at the current rate, or None if it is not known
+    last_frame_at: float | None  # time of the last end of a frame, seconds since 1970, or None
     reason: str | None  # why a stopped run was stopped, or None
 
     @property
     def num_left(self) -> int:
-        """Frames that have not ended."""
+        """Number of frames that have not ended."""
         return self.num_frames - self.num_done - len(self.failed)
 
 
 def read_status(out_dir: Path | str, now: float | None = None) -> RunStatus:
-    """The status of the latest run into a folder, at a time (seconds since 1970), by default now."""
+    """The status of the latest run into a folder at a time (seconds since 1970), by default now."""
     log = read_log(Path(out_dir))
     if log is None:
         raise DataFormatError(out_dir, "has no run.jsonl, so no run of 'directshape refine' is or was here")
     is_alive = log[0].is_alive is not False
-    # It may have ended since it was read.
+    # The run may have ended after its log was read.
     run, events = log if is_alive else read_log(Path(out_dir)) or log
     frames = {event.frame: event for event in events if event.frame is not None}
     checked = next((event for event in events if event.resumed is not None), None)
@@ -73,19 +73,19 @@ def read_status(out_dir: Path | str, now: float | None = None) -> RunStatus:
 
 
 def _rate(start: float, all_times: Sequence[float], now: float | None) -> float | None:
-    """Frames a second, of the latest ones; a run that is stuck becomes slower with every second that passes."""
+    """Frames per second over the latest frames; for a run that is stuck it decreases with time."""
     times = all_times[-_RECENT_FRAMES:]
     if not times:
         return None
     start, count = (start, len(times)) if len(times) == len(all_times) else (times[0], len(times) - 1)
-    # The frames in work are between two ends, so the mean gap is past before a silence says anything.
+    # Frames take about the mean gap between two ends, so only silence longer than this lowers the rate.
     gap = (times[-1] - start) / count
     end = times[-1] if now is None else max(times[-1], now - gap)
     return count / (end - start) if end > start else None
 
 
 def format_status(status: RunStatus, now: float | None = None) -> str:
-    """A few lines for people."""
+    """The status as a few lines of text."""
     now = time.time() if now is None else now
     earlier = f" ({status.num_resumed} of them in earlier runs)" if status.num_resumed else ""
     percent = 100 * (1 - status.num_left / status.num_frames) if status.num_frames else 100

@@ -1,4 +1,4 @@
-"""How a run over a data set ended: frames, cars and warnings, and how long the calls took."""
+"""This module summarises a run over a data set: frames, cars, warnings and times of the calls."""
 
 from __future__ import annotations
 
@@ -20,36 +20,36 @@ from directshape_torch.status import Status, counted
 TIMINGS = "timings.json"
 TIMINGS_SCHEMA_VERSION = 1
 _CPU = torch.device("cpu")
-# Cars without a mask that a warning names.
+# A warning names at most this many cars without a mask.
 _NAMED = 3
 
 
 @dataclass(frozen=True)
 class CallTiming:
-    """One call of the refiner, reading and writing not included."""
+    """A `CallTiming` is one call of the refiner, without reading and writing."""
 
-    frame_ids: tuple[str, ...]  # its frames
-    num_cars: int  # its cars
-    refine_s: float  # seconds that it took
+    frame_ids: tuple[str, ...]  # frames of the call
+    num_cars: int  # number of its cars
+    refine_s: float  # duration in seconds
     compiled: int = 0  # functions that were compiled or loaded in it
 
 
 @dataclass
 class RunTimings:
-    """All calls of a run, in order."""
+    """A `RunTimings` has all calls of a run, in order."""
 
-    device: torch.device = _CPU  # where the refiner ran
-    calls: list[CallTiming] = field(default_factory=list)  # one entry a call
-    workers: int = 1  # processes that refined side by side
-    threads: int = field(default_factory=torch.get_num_threads)  # of each
-    cpu_s: float = 0.0  # seconds that processors spent on the frames, in all workers, reading and writing included
-    wall_s: float = 0.0  # seconds from the first frame to the last, reading and writing included
-    peak_mb: float | None = None  # the largest resident memory of any of these processes, MB, where the system tells
+    device: torch.device = _CPU  # device of the refiner
+    calls: list[CallTiming] = field(default_factory=list)  # one entry for each call
+    workers: int = 1  # parallel processes
+    threads: int = field(default_factory=torch.get_num_threads)  # of each process
+    cpu_s: float = 0.0  # processor time for the frames, in all workers, including reading and writing
+    wall_s: float = 0.0  # seconds from the first frame to the last, including reading and writing
+    peak_mb: float | None = None  # the largest resident memory of any of these processes, MB, if the system reports it
     peak_device_mb: float | None = None  # the largest memory of tensors on a graphics card, MB
 
     @contextmanager
     def measure(self, frame_ids: Sequence[str], num_cars: int) -> Iterator[None]:
-        """Time the body as one call; waits for the device before and after."""
+        """Measure the body as one call; wait for the device before and after."""
         _wait_for(self.device)
         start, forms = time.perf_counter(), num_forms()
         yield
@@ -58,7 +58,7 @@ class RunTimings:
         self.calls.append(CallTiming(tuple(frame_ids), num_cars, seconds, num_forms() - forms))
 
     def add(self, other: RunTimings) -> None:
-        """Take in what a worker says."""
+        """Add the timings of another process."""
         self.calls += other.calls
         self.cpu_s += other.cpu_s
         self.peak_mb = _larger(self.peak_mb, other.peak_mb)
@@ -69,7 +69,7 @@ class RunTimings:
         return sum(len(call.frame_ids) for call in self.calls)
 
     def ms_per(self, number: int) -> float | None:
-        """Of all calls, over a number of cars or frames; None where there was none."""
+        """Mean milliseconds of all calls per car or frame, given their number; None for 0."""
         return 1000 * sum(call.refine_s for call in self.calls) / number if number else None
 
     @property
@@ -82,7 +82,7 @@ class RunTimings:
 
 
 def write_timings(out_dir: Path, timings: RunTimings) -> None:
-    """Write `timings.json` (schema 1): a file of its own, so that every other file is the same in every run."""
+    """Write `timings.json` (schema 1), a separate file, so that all other files are the same in every run."""
     content = {
         "schema_version": TIMINGS_SCHEMA_VERSION,
         "device": device_name(timings.device),
@@ -103,17 +103,17 @@ def write_timings(out_dir: Path, timings: RunTimings) -> None:
 
 
 def device_name(device: torch.device) -> str:
-    """ "cpu", or the name of the graphics card."""
+    """The name of the graphics card, or "cpu"."""
     return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
 
 
 def peak_memory_mb() -> float | None:
-    """The largest resident memory of the process so far, MB, or None where the system does not tell."""
+    """The largest resident memory of the process so far, MB, or None if the system does not report it."""
     status = Path("/proc/self/status")
     if status.exists():
-        # The program's name stands there, maybe cut within a character.
+        # The file contains the program's name, which may be cut within a character.
         lines = status.read_text(errors="replace").splitlines()
-        # Not what `getrusage` says: there a new process begins with the peak of the one that started it.
+        # `getrusage` is not used here, because a new process starts there with the peak of its parent.
         kib = next((line.split()[1] for line in lines if line.startswith("VmHWM:")), None)
         if kib is not None:
             return round(int(kib) / 2**10, 1)
@@ -122,7 +122,7 @@ def peak_memory_mb() -> float | None:
     except ImportError:  # only Unix has it
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    # macOS counts in bytes, others in KiB.
+    # macOS counts in bytes, other systems in KiB.
     return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
 
 
@@ -146,17 +146,17 @@ def _rounded(number: float | None) -> float | None:
 
 @dataclass(frozen=True)
 class RunSummary:
-    """Outcome of `refine_dataset`."""
+    """A `RunSummary` is the outcome of `refine_dataset`."""
 
-    frames: Mapping[str, Mapping[str, Any]]  # for each frame of the data set its entry of `summary.json`
+    frames: Mapping[str, Mapping[str, Any]]  # the entry in `summary.json` of each frame of the data set
     resumed: tuple[str, ...]  # frames that an earlier run had finished
     failed: Mapping[str, str]  # frames that could not be refined, with the reason
-    warnings: tuple[str, ...]  # things that look wrong though nothing failed
+    warnings: tuple[str, ...]  # likely mistakes that did not cause a failure
     timings: RunTimings  # of the calls of this run
 
     @property
     def num_cars(self) -> int:
-        """Cars of all frames that did not fail, refined or not."""
+        """Number of cars of all frames that did not fail, refined or not."""
         return sum(entry.get("cars", 0) for entry in self.frames.values() if entry["state"] == "done")
 
     @property
@@ -166,12 +166,12 @@ class RunSummary:
 
     @property
     def exit_code(self) -> int:
-        """0 when every frame is done, 1 when some failed."""
+        """0 if every frame is done, 1 if some failed."""
         return int(bool(self.failed))
 
 
 def count_statuses(frames: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
-    """Number of cars of each status that occurs, over the entries of `summary.json`."""
+    """Number of cars of each status that occurs in the entries of `summary.json`."""
     counts: Counter[str] = Counter()
     for entry in frames.values():
         counts.update(entry.get("statuses", {}))
@@ -179,7 +179,7 @@ def count_statuses(frames: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
 
 
 def find_warnings(frames: Mapping[str, Mapping[str, Any]], classes: Sequence[str]) -> tuple[str, ...]:
-    """Signs that a run was given the wrong things.
+    """Warnings about results that suggest wrong inputs of a run.
 
     Examples:
         >>> find_warnings({"000001": {"state": "done", "lines": 2, "cars": 0, "statuses": {}}}, ["Car"])
@@ -222,7 +222,7 @@ def _reasons(frames: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def format_summary(summary: RunSummary) -> str:
-    """What the program prints at the end of a run."""
+    """The text that the program prints at the end of a run."""
     done, timings = len(summary.frames) - len(summary.failed), summary.timings
     earlier = f", {len(summary.resumed)} of them in an earlier run" if summary.resumed else ""
     lines = [
@@ -232,7 +232,7 @@ def format_summary(summary: RunSummary) -> str:
     if timings.ms_per_frame is not None:
         per_car = "" if timings.ms_per_car is None else f"{timings.ms_per_car:.0f} ms per car, "
         where = device_name(timings.device)
-        # It is part of the calls in which it happens, and of a short run most of the time.
+        # Compiling is part of the calls that need it, and takes most of the time of a short run.
         compiling = " with compiling or loading code" if any(call.compiled for call in timings.calls) else ""
         lines.append(f"time     {per_car}{timings.ms_per_frame:.0f} ms per frame (refinement only{compiling}, {where})")
     if timings.workers > 1 and timings.wall_s:

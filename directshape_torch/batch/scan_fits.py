@@ -1,4 +1,4 @@
-"""Shapes fitted to the LiDAR scans of a data set, in boxes of any origin; no image is read."""
+"""This module fits shapes to the LiDAR scans of a data set, in boxes of any origin, without images."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from directshape_torch.shape.shape_prior import ShapePrior
 def fit_scan(dataset: StereoDataset, frame_id: str, out_dir: Path | str, prior: ShapePrior | None = None) -> ShapeFit:
     """Fit a pose and a shape, in the left camera frame, to the points in each box of a frame.
 
-    Writes `data/ID.txt` (result lines), `shapes/ID.npz` and `meshes/ID_LINE.ply`, the latter in the camera frame.
+    Write `data/ID.txt` (result lines), `shapes/ID.npz` and `meshes/ID_LINE.ply`, the meshes in the camera frame.
 
     Args:
-        dataset: opened with `lidar_dir` (`open_dataset`); its detections are the boxes, labels among them.
+        dataset: data set opened with `lidar_dir` (`open_dataset`); its detections, which may be labels, are the boxes.
         frame_id: one of `dataset.frame_ids`.
-        out_dir: gets the files.
-        prior: the shapes; default the bundled ones.
+        out_dir: folder of the files.
+        prior: shape prior. Default: the bundled one.
 
     Raises:
-        InputError: a data set without scans.
+        InputError: the data set has no scans.
         DataFormatError: a file is missing or damaged.
     """
     points, camera = dataset.scan(frame_id)

@@ -1,4 +1,4 @@
-"""What to think of a run without labels: how many boxes it improved, how sure that is, and what to distrust first."""
+"""This module judges a run without labels: how many boxes it improved, how certain that is, and what to check first."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from directshape_torch.status import Status
 
 _NAMED = 5
 _AT_M = 30.0
-# Boxes that were good are spoilt where a rig moves cars at 30 m by more than this.
+# Boxes that were good become worse if the error of a rig moves cars at 30 m by more than this.
 _LARGE_M = 0.4
 
 
 def verdict(frames: Mapping[str, Mapping[str, Any]], rigs: Sequence[RigEstimate]) -> list[str]:
-    """Sentences on the entries of `summary.json`, and on the rigs that the run has estimated.
+    """Sentences about the entries of `summary.json` and about the rigs that the run has estimated.
 
     Examples:
         >>> entry = {"state": "done", "cars": 2, "statuses": {"converged": 2}, "better": 1.6, "worse": 0.2}

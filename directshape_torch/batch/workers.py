@@ -1,4 +1,4 @@
-"""Other processes that refine the groups of a run, and what happens to those whose worker died."""
+"""This module refines the groups of a run in other processes and handles groups whose worker died."""
 
 from __future__ import annotations
 
@@ -22,23 +22,24 @@ from directshape_torch.batch.group_refinement import GroupReport, RunJob, limite
 from directshape_torch.errors import DirectShapeError
 from directshape_torch.io.run_manifest import FrameEntry
 
-# So many deaths before anything was ever finished are not the fault of single frames.
+# If this many workers die before any frame is finished, single frames are not the cause.
 _HOPELESS_DEATHS = 6
 _DEATH = "killed, out of memory or crashed"
-# Of a message that is cut short a plain OSError is raised.
+# A message that is cut short raises a plain OSError.
 _NOTHING_COMES = (EOFError, OSError)
 
 
 def reports_of(
     workers: LocalWorkers, groups: Sequence[FrameGroup], retries: int, entry_of: Callable[[str], FrameEntry | None]
 ) -> Iterator[GroupReport]:
-    """What became of the groups of a run, in the order in which they end.
+    """Reports of the groups of a run, in the order in which they end.
 
-    A group whose worker died is handed out again `retries` times, then by halves, down to single frames, without those
-    that are finished after all, as `entry_of` says. A frame whose worker died each time has failed.
+    A group whose worker died is handed out again `retries` times, then in halves, down to single frames. Frames that
+    were finished in spite of it, according to `entry_of`, are not repeated. A frame whose worker died each time has
+    failed.
 
     Raises:
-        DirectShapeError: workers die before any of them has finished anything.
+        DirectShapeError: workers die before any of them has finished a frame.
     """
     waiting, deaths = deque(groups), Counter[tuple[str, ...]]()
     num_handed_out, has_report = 0, False
@@ -71,7 +72,7 @@ def reports_of(
 
 @dataclass
 class _Worker:
-    """A process, the pipe to it and what it is doing; the job goes through the pipe with the first group."""
+    """A `_Worker` is a process with its pipe and its current group; the job is sent with the first group."""
 
     process: SpawnProcess
     pipe: Connection
@@ -80,19 +81,21 @@ class _Worker:
 
 
 class LocalWorkers:
-    """Processes, started with the first group, so that a death has one culprit and disturbs nobody else.
+    """A `LocalWorkers` has processes for groups of frames; they start with the first group.
 
-    Each has a pipe whose other end this process alone holds: however early a worker dies, the pipe ends. The standard
-    pools hold both ends, and wait for ever for a worker that died before it had read all of a large job.
+    The death of a process affects only its own group. Each process has a pipe whose other end only this process holds,
+    so the pipe ends whenever the worker dies. (The standard pools hold both ends, and wait for ever for a worker that
+    died before it had read a large job.)
 
-    Processes are spawned and not forked: threads of PyTorch do not survive a fork. They end with their parent, however
-    that ends. When the body ends, they finish the groups at hand. It may be interrupted anywhere: each worker is among
-    the others from before its process starts until it has ended, or nobody would close its pipe.
+    Processes are spawned and not forked, because threads of PyTorch do not survive a fork. They end with their parent,
+    in whatever way that ends. At the end of the body they finish their current groups. The body may be interrupted
+    anywhere, so a worker is in the list from before its process starts until it has ended; its pipe is then always
+    closed.
     """
 
     def __init__(self, job: RunJob, num_workers: int, threads: int | None) -> None:
         try:
-            # As bytes: tensors are copied and not shared.
+            # Bytes make sure that tensors are copied and not shared.
             self._job, self._threads = pickle.dumps(job), threads
         except (pickle.PicklingError, TypeError, AttributeError) as error:
             raise DirectShapeError(f"the job cannot be sent to other processes: {error}") from error
@@ -101,12 +104,12 @@ class LocalWorkers:
 
     def hand_out(self, group: FrameGroup) -> None:
         """Give a group to an idle process."""
-        # All of them start before the first waits for one to read a large job.
+        # All processes start before this one waits for a process to read a large job.
         while len(self._workers) < self.capacity:
             self._start_worker()
         worker = next(each for each in self._workers if each.group is None)
         worker.group = group
-        # One that is dead says so by its pipe, to whoever waits for the report.
+        # The pipe of a dead process tells its death to the caller of `next_reports`.
         with suppress(ConnectionError):
             if not worker.has_job:
                 worker.pipe.send_bytes(self._job)
@@ -114,7 +117,7 @@ class LocalWorkers:
             worker.pipe.send(group)
 
     def next_reports(self) -> list[tuple[FrameGroup, GroupReport | None]]:
-        """Wait for any process; of a group whose worker died there is no report.
+        """Wait for any process; the report of a group whose worker died is None.
 
         Raises:
             DirectShapeError: a worker cannot read the job.
@@ -158,14 +161,14 @@ class LocalWorkers:
 
 @contextmanager
 def _deaf_to_interrupts() -> Iterator[None]:
-    """Processes that start in the body never hear Ctrl-C, which reaches all of them; the parent decides what it means.
+    """Start processes in the body that ignore Ctrl-C, which all processes receive and only the parent handles.
 
-    From their first moment: until they could ignore it themselves, they import for seconds.
+    The signal is blocked from the start of a process, which imports for seconds before it could ignore the signal.
     """
     if not hasattr(signal, "pthread_sigmask"):  # only Unix has it
         yield
         return
-    resource_tracker.ensure_running()  # with the first process, it would let interrupts through again
+    resource_tracker.ensure_running()  # if the first process started it, it would unblock interrupts again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -174,7 +177,7 @@ def _deaf_to_interrupts() -> Iterator[None]:
 
 
 def _work(pipe: Connection, threads: int | None) -> None:
-    """The life of a worker: the job, then groups until the pipe ends."""
+    """Run a worker: read the job, then refine groups until the pipe ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # for systems where it could not be blocked
     threading.Thread(target=_end_with_parent, daemon=True).start()
     job: RunJob | str | None = None
@@ -191,7 +194,7 @@ def _work(pipe: Connection, threads: int | None) -> None:
 
 
 def _messages(pipe: Connection) -> Iterator[bytes]:
-    """Until the pipe ends."""
+    """The messages of a pipe until it ends."""
     with suppress(*_NOTHING_COMES):
         while True:
             yield pipe.recv_bytes()
@@ -201,7 +204,7 @@ def _loaded(content: bytes) -> RunJob | str:
     """The job, or why it cannot be read."""
     try:
         job: RunJob = pickle.loads(content)
-    # Whatever the code of a user's own classes raises in another process.
+    # A user's own classes may raise any error when they are loaded in another process.
     except Exception as error:
         return f"{type(error).__name__}: {error}"
     return job
