@@ -1,1 +1,1 @@
-"""The program `directshape`: one module a command."""
+"""This package is the program `directshape`, with one module for each command."""

@@ -1,7 +1,7 @@
 """`directshape build-prior`: make a shape prior from a folder of car meshes.
 
-Leave out meshes that do not look like cars by the given axes and scale, make the others solid, sample their signed
-distance and keep the principal components. Writes the prior and a report (.json) beside it.
+Meshes that do not look like cars by the given axes and scale are skipped. The others are made solid, their signed
+distance is sampled, and the principal components are kept. The command writes the prior and a report (.json) beside it.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.prior_file import PriorProvenance
 
 REPORT_SCHEMA = "directshape_torch.prior_report/1"
-# Of anything that drives or walks.
+# No vehicle or person is larger than this.
 _LARGEST_M = 30.0
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Meshes, axes and scale of their files, grid and components."""
+    """Add the options of meshes, grid and components."""
     parser.add_argument(
         "--meshes", type=Path, required=True, help="folder of obj, ply, glb, off or stl files, searched deep"
     )
@@ -61,7 +61,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Build the prior; 0 when all meshes were used, 3 when some were skipped."""
+    """Build the prior; return 0 if all meshes were used, 3 if some were skipped."""
     if not 0.02 <= args.spacing <= 0.5:
         raise InputError("--spacing", "0.02 to 0.5 m", f"{args.spacing}")
     if args.num_codes < 1:
@@ -113,7 +113,7 @@ def _check_enough(num_usable: int, skipped: Mapping[str, Exception], num_codes: 
 
 
 def _in_options(problem: Exception) -> str:
-    """What is wrong with a mesh, and the cure in options of this command."""
+    """The problem of a mesh, with its cure as options of this command."""
     if not isinstance(problem, UnlikelyMeshError):
         return str(problem)
     needs = f"it needs {_options(problem.cure)}, or " if problem.cure else ""
@@ -126,7 +126,7 @@ def _options(fields: Mapping[str, str | float]) -> str:
 
 
 def _grid_around(files: list[Path], spacing_m: float, options: MeshOptions) -> GridSpec:
-    """A grid with room for all meshes; one that cannot be read, or is larger than any vehicle, is refused later."""
+    """A grid that contains all meshes; unreadable meshes and meshes larger than any vehicle are refused later."""
     corners = []
     for file in files:
         with suppress(DataFormatError, MeshError):
@@ -143,7 +143,7 @@ def _find_meshes(folder: Path, pattern: str) -> list[Path]:
     if not folder.is_dir():
         raise InputError("--meshes", "a folder", str(folder))
     every = (file for file in folder.glob(pattern) if file.suffix.lower() in MESH_SUFFIXES and file.is_file())
-    # macOS puts a ._NAME beside each file that it copies.
+    # macOS writes a ._NAME beside each file that it copies.
     files = sorted(file for file in every if not file.name.startswith("."))
     if not files:
         raise InputError("--meshes", f"{', '.join(MESH_SUFFIXES)} files matching {pattern!r}", f"none in {folder}")
@@ -166,9 +166,10 @@ def _read_meshes(
 
 
 def _report(prior: PCAShapePrior, samples: Tensor, names: tuple[str, ...], skipped: dict[str, str]) -> dict[str, Any]:
-    """What is written to the JSON file beside the prior.
+    """The content of the JSON file beside the prior.
 
-    The error is the mean |reconstructed - true| distance within 7 cm of the surface of cars left out, None of two cars.
+    The error is the mean |reconstructed - true| distance within 7 cm of the surface of cars left out, None for two
+    cars.
     """
     errors = leave_one_out_errors_cm(samples, prior).tolist() if len(samples) >= 3 else []
     return {

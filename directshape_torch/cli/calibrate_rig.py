@@ -1,10 +1,10 @@
 """`directshape calibrate-rig`: what a stereo rig's disparities and a detector's depths are off by.
 
-Estimate by how much disparities are off over the images of a stereo rig, and the depths of a detector, for 'directshape
-refine --rig FILE'. 'refine' does this by itself from detections (docs/your_rig.md); here other evidence joins them:
-LiDAR scans (training/velodyne), disparity maps (training/disp_noc_0 or disp_occ_0), or consecutive frames of a car that
-drives past still things ('motion': ROOT is one sequence with image_02, image_03 and calib.txt, as in KITTI's tracking
-benchmark). Detections are taken from all frames, whichever are chosen. All kinds add up, those of --rig too.
+Estimate the errors of a stereo rig's disparities over the image, and of a detector's depths, for 'directshape refine
+--rig FILE'. 'refine' does this by itself from detections (docs/your_rig.md); this command adds other evidence: LiDAR
+scans (training/velodyne), disparity maps (training/disp_noc_0 or disp_occ_0), or consecutive frames of a car that
+drives past still objects ('motion': ROOT is one sequence with image_02, image_03 and calib.txt, as in KITTI's tracking
+benchmark). Detections are taken from all frames, whether chosen or not. Evidence of all kinds, also of --rig, adds up.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from directshape_torch.visualize.rig_picture import draw_rigs
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The data, kinds of evidence, and the file to write."""
+    """Add the options of the data, the kinds of evidence and the file to write."""
     add_data_options(parser, with_disparity=False)
     parser.add_argument(
         "--from",
@@ -53,7 +53,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Estimate, write file and picture, report; 0, or 1 where there is no evidence."""
+    """Estimate the rigs, write file and picture, report; return 0, or 1 if there is no evidence."""
     if args.out.suffix == ".png":
         raise InputError("--out", "another ending than .png, which is that of the picture", str(args.out))
     check_file("--out", args.out)
@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _add_truth(args: argparse.Namespace, source: TruthSource, rigs: list[RigEstimate]) -> None:
-    """Every frame that can be read; one that cannot is reported and left out."""
+    """Add the evidence of every readable frame; an unreadable one is reported and left out."""
     layout, truth, frames = object_layout(args.data, args.data), truth_files(args.data, source), []
     names = list(truth) if args.frames is None else frames_among(list(truth), args.frames, f"ids with {source}")
     for frame_id in Bar(names, desc=source, unit="frame", disable=None):

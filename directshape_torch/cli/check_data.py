@@ -1,9 +1,9 @@
 """`directshape check-data`: explain what is wrong with a data set.
 
-Look for what is commonly wrong with stereo data: swapped or unrectified images, calibration of the wrong sign or size,
-masks of another frame or size, boxes in another convention, distances that the disparity contradicts, files that are
-missing or damaged. Each finding says what was measured, what was expected and how to mend it (docs/check_data.md). Exit
-code: 0 no errors, 1 errors were found, 2 wrong usage.
+Look for common mistakes in stereo data: swapped or unrectified images, calibration of the wrong sign or size, masks of
+another frame or size, boxes in another convention, distances that the disparity contradicts, files that are missing or
+damaged. Each finding says what was measured, what was expected and how to correct it (docs/check_data.md). The exit
+code is 0 for no errors, 1 if errors were found, 2 for wrong usage.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from directshape_torch.scene_check.finding import CheckReport, unreadable
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The data set, and how much of it is read."""
+    """Add the options of the data set and of the extent of the check."""
     inputs = parser.add_argument_group("input")
     add_data_options(inputs)
     add_lidar_option(inputs)
@@ -38,7 +38,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check, print and write."""
+    """Check the data set, print the report and write it if asked."""
     report = _report(args)
     if str(args.json) == "-":
         print(json.dumps(report_content(report), indent=2))
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _report(args: argparse.Namespace) -> CheckReport:
-    """A data set that cannot even be opened has one finding, and that says why."""
+    """Check the data set; a data set that cannot be opened has one finding that says why."""
     max_frames = None if args.all_frames else args.max_frames
     try:
         dataset = dataset_of(args)

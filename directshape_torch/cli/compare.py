@@ -1,9 +1,9 @@
 """`directshape compare`: measure results before and after a refinement.
 
-Compare result files before and after a refinement with labels: centre, yaw, bird's-eye and 3D overlap, shares above 0.7
-and made worse by 0.05, for all detections and by distance, with n and bootstrap intervals over cars. A detection takes
-the label of largest 2D overlap (at least 0.3, one to one), without a 2D box the nearest one within 4 m. Counted are Car
-labels at least 25 px high, occluded <= 1, truncated <= 0.5.
+Compare result files before and after a refinement with labels: centre, yaw, bird's-eye and 3D IoU, shares above 0.7 and
+made worse by 0.05, for all detections and by distance, with n and bootstrap intervals over cars. A detection is matched
+to the label of largest 2D IoU (at least 0.3, one to one), without a 2D box to the nearest label within 4 m. Only Car
+labels at least 25 px high, occluded <= 1, truncated <= 0.5 count.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from directshape_torch.evaluation.reports import format_comparison, write_compar
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Labels, results before and after, frames, tables."""
+    """Add the options of labels, results before and after, frames and tables."""
     parser.add_argument(
         "--labels",
         type=Path,
@@ -37,7 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare, print and write."""
+    """Compare the results, print and write the scores."""
     comparison = compare_results(
         args.labels,
         args.before,

@@ -1,7 +1,7 @@
 """`directshape demo`: refine the bundled stereo frame.
 
-Refine the bundled stereo frame, a path-traced street with cars of our own, from noisy detections; print the errors
-before and after, and write the results, a picture and a 3D scene (scene.glb) for any glTF viewer.
+Refine the bundled stereo frame, a path-traced street with the project's own cars, from noisy detections; print the
+errors before and after, and write the results, a picture and a 3D scene (scene.glb) for any glTF viewer.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ DEMO_FOLDER = Path(__file__).parent.parent / "assets" / "demo"
 
 
 def demo_dataset(frames: Iterable[int | str] | None = None) -> StereoDataset:
-    """The bundled frame, with noisy detections."""
+    """The bundled frame with noisy detections."""
     folder = DEMO_FOLDER
     return open_dataset("kitti", folder, folder / "detections/noisy_stereo", folder / "training/masks", frames=frames)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Folder, settings and device."""
+    """Add the options of folder, settings and device."""
     parser.add_argument(
         "--out",
         type=Path,
@@ -50,10 +50,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Refine by the same way as `directshape refine`, then report."""
+    """Refine the bundled frame in the same way as `directshape refine`, then report."""
     dataset = demo_dataset()
     refiner = make_refiner(args.config, [], "pca", args.device)
-    # Where others share the cores, several threads wait for each other: minutes instead of seconds for one frame.
+    # If other programs share the cores, several threads wait for each other, which makes one frame take minutes.
     with ProgressBar() as progress, limited_threads(1):
         summary = refine_dataset(dataset, refiner, args.out, RefineOptions(overlays=True), progress, fresh=args.fresh)
         (frame_id,) = dataset.frame_ids
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def error_table(loaded: LoadedFrame, result: FrameResult) -> str:
-    """Centre, heading and bird's-eye overlap of each car against its label, before and after."""
+    """A table of centre, heading and bird's-eye IoU of each car against its label, before and after."""
     before, after = loaded.detected_objects, result.cars
     found = match_to_labels(before, loaded.labels or [])
     sides = [errors_of([objects[car] for car in found], list(found.values())) for objects in (before, after)]
@@ -80,7 +80,7 @@ def error_table(loaded: LoadedFrame, result: FrameResult) -> str:
 
 
 def _columns(sides: Sequence[Sequence[CarErrors]]) -> tuple[str, str, str]:
-    """Before and after of centre, yaw and overlap, averaged over cars."""
+    """Centre, yaw and IoU before and after, averaged over cars."""
 
     def change(name: str, decimals: int) -> str:
         values = [fmean(getattr(car, name) for car in side) for side in sides]

@@ -1,8 +1,8 @@
 """`directshape evaluate`: average precision of results, as KITTI measures it.
 
 Score result files as KITTI's object devkit (2017) does: average precision of 2D boxes, in bird's-eye view and in 3D at
-IoU 0.7 and 0.5, easy / moderate / hard, over 11 and over 40 recall points, orientation similarity where the results
-carry alpha.
+IoU 0.7 and 0.5, easy / moderate / hard, over 11 and over 40 recall points, and orientation similarity if the results
+have alpha.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from directshape_torch.evaluation.reports import format_scores, write_scores
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Labels, results and the class."""
+    """Add the options of labels, results and class."""
     parser.add_argument("--labels", type=Path, required=True, metavar="DIR", help="KITTI labels, NNNNNN.txt")
     parser.add_argument("--results", type=Path, required=True, metavar="DIR", help="result files (or DIR/data)")
     add_frame_choice(parser, "all of --labels")
@@ -25,7 +25,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate, print and write."""
+    """Evaluate the results, print and write the scores."""
     scores = evaluate_kitti(args.labels, args.results, frames=args.frames, split=args.split, object_type=args.type)
     print(format_scores(scores), end="")
     if args.json is not None:

@@ -2,7 +2,7 @@
 
 Measure shapes before (mean shape at the pose of the detection) and after a refinement against true depths:
 completeness, accuracy, F1 and RMSE over the distance tau, 0.05 to 1.0 m, as the paper defines them, with n and
-bootstrap intervals over cars. Counted are Car labels at least 25 px high, occluded <= 1, truncated <= 0.5.
+bootstrap intervals over cars. Only Car labels at least 25 px high, occluded <= 1, truncated <= 0.5 count.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from directshape_torch.shape.load_prior import load_prior
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What went in, what came out, the truth, tables."""
+    """Add the options of inputs, outputs, truth and tables."""
     parser.add_argument(
         "--data", type=Path, required=True, metavar="ROOT", help="holds training, with calib, disp_occ_0 .."
     )
@@ -37,7 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate, print and write."""
+    """Evaluate the shapes, print and write the scores."""
     scores = evaluate_shapes(
         args.data,
         args.detections,

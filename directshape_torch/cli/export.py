@@ -1,8 +1,8 @@
 """`directshape export`: a finished run for other programs.
 
 Write the finished frames of an output folder of 'directshape refine' for other programs: surfaces as GLB or PLY and
-points as PLY, coloured by the left image, boxes as KITTI, COCO-3D or nuScenes files, and all of it as a recording for
-Rerun's viewer. OUT itself is only read. docs/outputs.md says what is in which frame.
+points as PLY, coloured by the left image; boxes as KITTI, COCO-3D or nuScenes files; and all of these as a recording
+for Rerun's viewer. OUT itself is only read. docs/outputs.md gives the coordinate frame of each file.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from directshape_torch.visualize.run_frames import RunInputs
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The run, formats, inputs of the run, appearance."""
+    """Add the options of the run, formats, inputs and appearance."""
     parser.add_argument("run_folder", type=Path, metavar="OUT", help="output folder of 'refine'")
     parser.add_argument("--format", nargs="+", required=True, choices=FORMATS, metavar="NAME", help=", ".join(FORMATS))
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets the files")
@@ -50,7 +50,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Export and say where to."""
+    """Export the run and print where."""
     folder = RunFolder(args.run_folder, args.frames)
     inputs = inputs_of_run(args, folder)
     options = _make_options(args, inputs)
@@ -71,7 +71,7 @@ def _make_options(args: argparse.Namespace, inputs: RunInputs) -> ExportOptions:
 
 
 def _make_refiner(args: argparse.Namespace, inputs: RunInputs) -> DirectShapeRefiner:
-    """The refiner of the run, on the processor and not compiled: a few frames are not worth it."""
+    """The refiner of the run, on the CPU and not compiled, since compiling does not pay for a few frames."""
     if "rerun" not in args.format:
         raise InputError("--iterations", "--format rerun, which alone records them", " ".join(args.format))
     given = {"data": args.data, "detections": args.detections, "masks": mask_source(args)}

@@ -1,10 +1,10 @@
 """`directshape fit-shape`: fit shapes to LiDAR points in boxes.
 
-Fit a pose and a shape to the points in each box, without images. Of one cloud (--points, --boxes FILE), in its own
-frame: OUT/boxes.txt (seven numbers a line in the convention of the input), OUT/shapes.npz (poses, codes, statuses,
-distances of the points) and OUT/meshes/NNN.ply. Of a data set (--data, --lidar, --boxes DIR): OUT/data/ID.txt
-(KITTI result lines, for 'directshape compare'), OUT/shapes/ID.npz and OUT/meshes/ID_LINE.ply in the left camera frame.
-Exit code: 0, or 2 for wrong usage or input.
+Fit a pose and a shape to the points in each box, without images. For one cloud (--points, --boxes FILE) the results are
+in its own frame: OUT/boxes.txt (seven numbers in each line, in the convention of the input), OUT/shapes.npz (poses,
+codes, statuses, distances of the points) and OUT/meshes/NNN.ply. For a data set (--data, --lidar, --boxes DIR) they are
+OUT/data/ID.txt (KITTI result lines, for 'directshape compare'), OUT/shapes/ID.npz and OUT/meshes/ID_LINE.ply in the
+left camera frame. The exit code is 0, or 2 for wrong usage or input.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from directshape_torch.shape.load_prior import load_prior
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """A cloud or a data set with scans, boxes, shapes."""
+    """Add the options of a cloud or a data set with scans, boxes and shapes."""
     where = parser.add_mutually_exclusive_group(required=True)
     where.add_argument(
         "--points", type=Path, metavar="FILE", help="points.npy (P, 3 or more), or KITTI's velodyne .bin"
@@ -57,7 +57,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, fit, write, print."""
+    """Read the points and boxes, fit, write and print."""
     check_folder("out", args.out)
     return _fit_cloud(args) if args.lidar is None else _fit_scans(args)
 
@@ -81,7 +81,7 @@ def _fit_scans(args: argparse.Namespace) -> int:
 
 
 def _summary(fits: Sequence[ShapeFit]) -> str:
-    """How many cars were fitted, and how far their points are from the surfaces in the mean."""
+    """Text with the number of fitted cars and the mean distance of their points to the surfaces."""
     refined = torch.cat([fit.cars.refined for fit in fits])
     before, after = (
         float(torch.cat([getattr(fit, f"distance_{when}_m") for fit in fits])[refined].mean())
@@ -113,10 +113,10 @@ def _fit_cloud(args: argparse.Namespace) -> int:
 
 
 def read_boxes(path: Path) -> NDArray[np.float64]:
-    """Boxes (B, 7) of a text file, seven numbers a line.
+    """Boxes (B, 7) of a text file, seven numbers in each line.
 
     Raises:
-        DataFormatError: the file cannot be read, or a line holds something else.
+        DataFormatError: the file cannot be read, or a line has another content.
     """
     cure = "write x y z, three sizes and the heading, metres and radians"
     rows = [finite_numbers(path, line, 7, cure=cure) for line in read_lines(path)]

@@ -1,7 +1,7 @@
 """`directshape inspect`: figures of single cars.
 
-Refine the cars of a frame and draw the course of every one: sampled pixels, residuals, contour, box and costs of each
-iteration, and how it would drift by silhouettes alone. docs/outputs.md shows the pictures.
+Refine the cars of a frame and draw the course of each: sampled pixels, residuals, contour, box and costs of each
+iteration, and its drift in a refinement by silhouettes only. docs/outputs.md shows the pictures.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _FIGURES: dict[str, Callable[[CarCourse], Picture]] = {
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Frame and car, or frames and their tracks; settings."""
+    """Add the options of frame and car, or frames and their tracks, and settings."""
     data = parser.add_argument_group("input")
     data.add_argument("--demo", action="store_true", help="the bundled frame, without data")
     data.add_argument("--frame", metavar="ID", type=frame_id_of, help="the frame; --frames for several")
@@ -60,10 +60,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Draw what the options ask for."""
+    """Draw the pictures that the options ask for."""
     check_folder("out", args.out)
     dataset = _dataset(args)
-    # One frame is not worth a compilation, and pictures need no graphics card.
+    # Compiling does not pay for one frame, and pictures need no graphics card.
     refiner = make_refiner(args.config, ["compile=off", *args.set], args.prior, "cpu")
     refiner.rig = RigEstimates(known_rigs(args.rig))
     if args.tracks:
@@ -96,7 +96,7 @@ def _dataset(args: argparse.Namespace) -> StereoDataset:
 
 
 def _rows(loaded: LoadedFrame, line: int | None) -> list[int]:
-    """Rows of the detections to draw: all, or that of a line of the detection file."""
+    """Rows of the detections to draw: all rows, or the row of one line of the detection file."""
     lines = [one.line_number for one in loaded.detected_objects]
     if line is None:
         return list(range(len(lines)))
@@ -114,9 +114,9 @@ def inspect_frame(
     *,
     must_refine: bool = False,
 ) -> None:
-    """Refine all cars of a frame and draw those of some rows: `FRAME.png`, and a folder `FRAME_LINE` a car; on the CPU.
+    """Refine all cars of a frame on the CPU and draw some rows: `FRAME.png`, and a folder `FRAME_LINE` for each car.
 
-    Raises `InputError` where one `must_refine` and was not; says why.
+    If a car that `must_refine` was not refined, `InputError` is raised with the reason.
     """
     trace = trace_refinement(refiner, loaded.frame, loaded.detections)
     _report(loaded, trace, rows, must_refine)
@@ -135,7 +135,7 @@ def inspect_frame(
 
 
 def silhouette_trace(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> RefinementTrace | None:
-    """Of a refinement by silhouettes and priors alone; None where the refiner lacks one of the paper's terms."""
+    """The trace of a refinement by silhouettes and priors, or None if the refiner lacks one of the paper's terms."""
     config = refiner.config
     if config.method != "direct" or not (config.photometric.weight > 0 and config.silhouette.weight > 0):
         return None
@@ -143,7 +143,7 @@ def silhouette_trace(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> Refine
 
 
 def _report(loaded: LoadedFrame, trace: RefinementTrace, rows: Sequence[int], must_refine: bool) -> None:
-    """A line a car: how it ended, its cost before and after."""
+    """Print a line for each car with its status and its cost before and after."""
     result = trace.result
     for row in rows:
         status = result.status[row]
@@ -191,7 +191,7 @@ def inspect_tracks(loaded: Sequence[LoadedFrame], refiner: DirectShapeRefiner, o
 
 
 def _picture(item: LoadedFrame, car: DrawnCar) -> Picture:
-    """The car's part of the left image, with its box and contour; all of one size."""
+    """The part of the left image around a car, with its box and contour; all parts have one size."""
     image = View.of_frame(item.frame)
     view = image.around(car.corners_cam, _SIZE_PX) or View(np.zeros((*_SIZE_PX[::-1], 3), np.uint8), image.P)
     draw_box(view, car.corners_cam, car.colour)

@@ -1,4 +1,4 @@
-"""The program `directshape`: finds the command, runs it, turns errors into one line and an exit code."""
+"""This module is the program `directshape`: it runs a command and turns errors into one line and an exit code."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ EXIT_INTERRUPTED = 130
 EXIT_OUTPUT_CLOSED = 141
 EXIT_TERMINATED = 143
 
-# Each module has a docstring that is the command's help, `add_options(parser)` and `run(args) -> int`, whose errors
+# Each module has a docstring with the help of the command, `add_options(parser)` and `run(args) -> int`, whose errors
 # `main` shows.
 COMMANDS = (
     "refine",
@@ -48,10 +48,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program.
 
     Args:
-        arguments: words of the command line; default those of the process.
+        arguments: words of the command line. Default: the words of the process.
 
     Returns:
-        The exit code (docs/file_formats.md): 0 all fine, 1 finished with failures, 2 wrong usage or input.
+        The exit code (docs/file_formats.md): 0 success, 1 finished with failures, 2 wrong usage or input.
     """
     parser = make_parser()
     args = parser.parse_args(arguments)
@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.print_help(sys.stderr)
         return EXIT_WRONG_INPUT
     try:
-        # Before any work: a page or table that cannot be written afterwards.
+        # A page or table that cannot be written is refused before any work.
         for name in ("html", "json", "csv"):
             if isinstance(path := getattr(args, name, None), Path) and str(path) != "-":
                 check_file(f"--{name}", path)
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (DirectShapeError, OSError) as error:
         if isinstance(error, BrokenPipeError) and _output_was_closed():
             return EXIT_OUTPUT_CLOSED
-        # OSError: a full disk or a folder that may not be written, for which a traceback helps nobody.
+        # An OSError is a full disk or a folder without permission, for which a traceback is of no use.
         print(f"directshape: error: {' '.join(str(error).split())}", file=sys.stderr)
         return EXIT_WRONG_INPUT
     except _TerminatedError:
@@ -87,12 +87,12 @@ class _TerminatedError(KeyboardInterrupt):
 
 @contextmanager
 def _terminable() -> Iterator[None]:
-    """Let SIGTERM end the body like Ctrl-C, so that a run says that it has stopped."""
+    """Let SIGTERM end the body like Ctrl-C, so that a run records its stop."""
 
     def end(*_: object) -> None:
         raise _TerminatedError("SIGTERM")
 
-    # Of other threads nobody may set what a signal does.
+    # Only the main thread may set signal handlers.
     is_ours = threading.current_thread() is threading.main_thread()
     before = signal.signal(signal.SIGTERM, end) if is_ours else None
     try:
@@ -104,7 +104,7 @@ def _terminable() -> Iterator[None]:
 
 @contextmanager
 def _plain_warnings() -> Iterator[None]:
-    """Show the warnings about priors in a line, without a place in the code, as errors are shown."""
+    """Show warnings about priors in one line, without a place in the code, as errors are shown."""
     with warnings.catch_warnings():
         otherwise = warnings.showwarning
 
@@ -126,12 +126,12 @@ def _plain_warnings() -> Iterator[None]:
 
 
 def _output_was_closed() -> bool:
-    """Whether nobody reads the output any more, as after `| head`; what is left of it then goes nowhere."""
+    """Whether the reader of the output has closed it, as after `| head`; if so, discard further output."""
     try:
-        # What failed to be written is forgotten: only one more try tells whether it was this pipe that broke.
+        # The text that failed is discarded, so only another write shows whether this pipe is broken.
         print(flush=True)
     except BrokenPipeError:
-        # Else the interpreter would try once more as it ends, and complain.
+        # Otherwise the interpreter would write again at its end and print an error.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return True
     return False

@@ -1,6 +1,7 @@
-"""The options that several commands share, and what they stand for: data, frames, settings, a finished run.
+"""This module defines the options that several commands share, and what they stand for.
 
-What is wrong with one of them raises an error of the package that names it, for the main program to show.
+They are data, frames, settings and a finished run. A wrong option raises an error of the package that names the option,
+and the main program shows it.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _EITHER = "either a folder (--masks DIR) or COCO files (--masks-left FILE, --mas
 
 
 def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = True, required: bool = True) -> None:
-    """`--data`, `--layout`, `--detections`, masks, choice of frames and classes, ground, the rig's correction."""
+    """Add `--data`, `--layout`, `--detections`, masks, choice of frames and classes, ground and `--rig`."""
     add_layout_options(group, required)
     group.add_argument(
         "--detections", type=Path, metavar="DIR", help="NNNNNN.txt in DIR or DIR/data (folder: default ROOT/frames)"
@@ -61,7 +62,7 @@ def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = T
 
 
 def add_layout_options(group: argparse._ActionsContainer, required: bool = False) -> None:
-    """`--data`, `--layout`, and which frames and classes of it."""
+    """Add `--data`, `--layout` and the choice of frames and classes."""
     group.add_argument("--data", type=Path, required=required, metavar="ROOT", help="folder of the data set")
     group.add_argument(
         "--layout",
@@ -75,12 +76,12 @@ def add_layout_options(group: argparse._ActionsContainer, required: bool = False
 
 
 def add_rig_option(group: argparse._ActionsContainer, words: str) -> None:
-    """`--rig`."""
+    """Add `--rig`."""
     group.add_argument("--rig", default="none", metavar="FILE|none", help=words)
 
 
 def add_mask_options(group: argparse._ActionsContainer) -> None:
-    """The ways to name instance masks, for `mask_source`."""
+    """Add the options that name instance masks, for `mask_source`."""
     group.add_argument(
         "--masks",
         type=Path,
@@ -92,20 +93,20 @@ def add_mask_options(group: argparse._ActionsContainer) -> None:
 
 
 def add_lidar_option(group: argparse._ActionsContainer) -> None:
-    """`--lidar`."""
+    """Add `--lidar`."""
     words = "LiDAR scans NNNNNN.bin (KITTI's velodyne) as further evidence"
     group.add_argument("--lidar", type=Path, metavar="DIR", help=words)
 
 
 def add_config_option(group: argparse._ActionsContainer) -> None:
-    """`--config`, which stays text: ./paper is a file and paper the bundled settings."""
+    """Add `--config`, whose value stays text, since ./paper is a file but paper the bundled settings."""
     group.add_argument(
         "--config", metavar="FILE|NAME", help="settings of the refinement (YAML), or default, paper or fast"
     )
 
 
 def add_refiner_options(group: argparse._ActionsContainer) -> None:
-    """`--config`, `--set` and `--prior`, for `make_refiner`."""
+    """Add `--config`, `--set` and `--prior`, for `make_refiner`."""
     add_config_option(group)
     words = "single settings, e.g. photometric.weight=2"
     group.add_argument("--set", action="extend", nargs="+", default=[], metavar="KEY=VALUE", help=words)
@@ -115,19 +116,19 @@ def add_refiner_options(group: argparse._ActionsContainer) -> None:
 
 
 def add_device_option(group: argparse._ActionsContainer) -> None:
-    """`--device`, for `make_refiner`."""
+    """Add `--device`, for `make_refiner`."""
     group.add_argument("--device", default="auto", help="cpu, cuda, cuda:1 ..; default: cuda where there is one")
 
 
 def add_frame_choice(parser: argparse.ArgumentParser, default: str) -> None:
-    """`--split` or `--frames`; `default` says which frames count without them."""
+    """Add `--split` and `--frames`; `default` says which frames are used without them."""
     chosen = parser.add_mutually_exclusive_group()
     chosen.add_argument("--split", type=Path, metavar="FILE", help=f"a frame a line; default: {default}")
     chosen.add_argument("--frames", nargs="+", metavar="ID", type=frame_id_of, help="only these frames, e.g. 107 7322")
 
 
 def add_interval_options(parser: argparse.ArgumentParser) -> None:
-    """`--seed` and `--draws` of intervals over cars."""
+    """Add `--seed` and `--draws` of intervals over cars."""
     parser.add_argument("--seed", type=int, default=0, help="of the bootstrap (default 0)")
     parser.add_argument("--draws", type=int, default=2000, help="of the bootstrap (default 2000)")
 
@@ -155,7 +156,7 @@ def dataset_of(args: argparse.Namespace) -> StereoDataset:
 
 
 def frame_id_of(word: str) -> int | str:
-    """Numbers name frames in each layout's own way, with leading zeros or without; anything else is a whole name."""
+    """A frame number, which may have leading zeros, or the whole name of a frame."""
     return int(word) if word.isdecimal() else word
 
 
@@ -184,14 +185,15 @@ def make_refiner(
 
 
 def find_device(name: str) -> torch.device:
-    """The device of that name; "auto" is a graphics card where there is one."""
+    """The device with the given name; "auto" is a graphics card if there is one."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)
         torch.zeros(1, device=device)
-    # PyTorch has no exception of its own for this: RuntimeError for an unknown name or number, AssertionError for a
-    # backend it was compiled without, ImportError for one that a package must bring. Its reason goes into the message.
+    # PyTorch has no exception of its own for this. It raises RuntimeError for an unknown name or number, AssertionError
+    # for a backend that is not compiled in, and ImportError for a backend of a missing package. The message contains
+    # its reason.
     except (RuntimeError, AssertionError, ImportError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError("--device", "a device of this machine", f"{name!r} ({reason})", "try cpu") from error
@@ -199,7 +201,7 @@ def find_device(name: str) -> torch.device:
 
 
 def add_run_inputs(group: argparse._ActionsContainer, needed_for: str) -> None:
-    """`--data`, `--layout`, `--detections`, masks, rig and prior of a run; all may be left out."""
+    """Add `--data`, `--layout`, `--detections`, masks, rig and prior of a run; all are optional."""
     group.add_argument("--data", type=Path, metavar="ROOT", help=f"data set of the run, {needed_for}")
     group.add_argument(
         "--layout", choices=get_args(LayoutName), default="kitti", help="of that data set (default: kitti)"
@@ -223,7 +225,7 @@ def dataset_of_run(args: argparse.Namespace, run: RunFolder) -> StereoDataset | 
     return open_dataset(
         args.layout,
         args.data,
-        # A layout needs a folder of detections: where nobody says which, the result files stand in.
+        # A layout needs a folder of detections, so the result files take their place if none is given.
         run.path if args.detections is None and args.layout != "folder" else args.detections,
         mask_source(args),
         frames=run.frame_ids,
@@ -236,14 +238,14 @@ def dataset_of_run(args: argparse.Namespace, run: RunFolder) -> StereoDataset | 
 
 
 def inputs_of_run(args: argparse.Namespace, run: RunFolder) -> RunInputs:
-    """The chosen frames of a run and what the options say went into them; a plain folder keeps its detections."""
+    """The chosen frames of a run with their inputs according to the options; a plain folder has its own detections."""
     dataset = dataset_of_run(args, run) if run.frame_ids else None
     has_detections = args.layout == "folder" or args.detections is not None
     return RunInputs(run, prior_of_run(args.prior, run), dataset, has_detections)
 
 
 def prior_of_run(source: str | None, run: RunFolder) -> ShapePrior | None:
-    """The named prior, which must be the run's, or the bundled one that it used; None where it used another."""
+    """The named prior, which must be the run's, or the run's bundled prior; None if the run used another one."""
     wanted = run.manifest.sha256["prior"]
     priors = map(load_prior, BUNDLED_PRIORS if source is None else (source,))
     found = next((prior for prior in priors if hash_prior(prior) == wanted), None)
@@ -253,9 +255,9 @@ def prior_of_run(source: str | None, run: RunFolder) -> ShapePrior | None:
 
 
 def _fields_of_run(rig: str, run: RunFolder) -> tuple[DisparityField, ...]:
-    """The disparity fields that a run was made with, of its own folder or of the file that `--rig` names, no others."""
+    """The disparity fields of a run, from its own folder or from the file of `--rig`, which must match."""
     own, wanted = run.path / RIG_FILE, run.manifest.sha256["stereo_bias"]
-    # An estimate of an earlier run may still lie in the folder of one that was made without.
+    # The folder may still contain an estimate of an earlier run.
     if rig == "none" and (wanted is None or not own.is_file()):
         return ()
     path = own if rig == "none" else Path(rig)

@@ -1,4 +1,4 @@
-"""Progress bars over frames, on stderr."""
+"""This module shows progress bars over frames on stderr."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from directshape_torch.batch.options import RunObserver
 
 
 class Bar(tqdm):  # type: ignore[type-arg]
-    """Without the thread that would outlive it, and shown after the first step, so that an error comes alone."""
+    """A `Bar` has no thread that would outlive it, and appears after the first step, so errors appear without it."""
 
     monitor_interval = 0
 
@@ -21,7 +21,7 @@ class Bar(tqdm):  # type: ignore[type-arg]
 
 
 class ProgressBar(RunObserver):
-    """Counts frames and tells of those that fail, while `refine_dataset` runs."""
+    """A `ProgressBar` counts frames and prints failures while `refine_dataset` runs."""
 
     def __init__(self) -> None:
         self._bar: Bar | None = None
@@ -35,12 +35,12 @@ class ProgressBar(RunObserver):
             self._bar.close()
 
     def started(self, frame_ids: Sequence[str]) -> None:
-        """Show the bar; nothing where there is nothing to do."""
+        """Show the bar, unless there are no frames to refine."""
         if frame_ids:
             self._bar = Bar(total=len(frame_ids), unit="frame", desc="refine")
 
     def finished(self, frame_id: str, failure: str | None) -> None:
-        """Advance; print the reason of a failure above the bar."""
+        """Advance the bar; print the reason of a failure above it."""
         assert self._bar is not None, "a frame finished before the run started"
         if failure is not None:
             self._num_failed += 1

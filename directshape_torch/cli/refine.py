@@ -1,8 +1,8 @@
 """`directshape refine`: refine the cars of a data set.
 
 Refine the rough 3D boxes of a detector: poses, boxes and shapes of all cars of all frames. A second run with the same
-settings continues where the first stopped, however it stopped; 'directshape status' tells how far it is. Exit code: 0
-all frames done, 1 some frames failed, 2 wrong usage or input, or a run that could not go on.
+settings continues an interrupted first one; 'directshape status' shows its progress. The exit code is 0 if all frames
+are done, 1 if some frames failed, 2 for wrong usage or input, or if the run could not continue.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ from directshape_torch.scene_check.finding import SAID_BY_THE_RUN, by_severity
 from directshape_torch.terms.lidar import LidarPoints
 from directshape_torch.visualize.rig_picture import draw_rigs
 
-# Enough to tell a mistake from the noise of a detector.
+# This number of frames distinguishes a mistake from the noise of a detector.
 _CHECKED_FRAMES = 3
-# Beyond, the views of a car add little; longer sequences go through windows of so many.
+# More views of a car add little, so longer sequences are refined in windows of this many frames.
 _TRACK_FRAMES = 16
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Input, output, settings, workers."""
+    """Add the options of input, output, settings and workers."""
     inputs = parser.add_argument_group("input")
     add_data_options(inputs)
     inputs.set_defaults(rig="auto")
@@ -105,7 +105,7 @@ def _add_workers(group: argparse._ArgumentGroup) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Refine, write, report."""
+    """Refine the data set, write the results and report."""
     default_frames = _TRACK_FRAMES if args.tracks else 1
     batch_frames = default_frames if args.batch_frames is None else args.batch_frames
     options = RefineOptions(args.meshes, args.overlays, batch_frames, args.workers, args.threads, args.retries)
@@ -113,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
     extra = [] if args.lidar is None else [LidarPoints()]
     exact = ["rig.disparity_sigma_px=0"] if args.rig == "none" else []
     settings = [*exact, *args.set, *chosen]
-    # The data set is looked at below, so that calls need not look again.
+    # The data set is checked below, so the calls need no check.
     refiner = make_refiner(args.config, [*settings, "check=off"], args.prior, args.device, extra)
     if args.disparity is not None and refiner.config.method in ("direct", "box_alignment"):
         raise InputError(
@@ -137,7 +137,7 @@ def run(args: argparse.Namespace) -> int:
     for warning in summary.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     print(format_summary(summary))
-    # The report of this run, which finds the rigs of the folder alone, shall say the same.
+    # The report of this run uses only the rigs in the folder, and must say the same.
     sentences = verdict(summary.frames, rigs if args.rig == "auto" else [])
     if args.rig == "none" and refiner.config.rig.disparity_sigma_px == 0:
         sentences.append(
@@ -150,14 +150,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _warn_of(dataset: StereoDataset) -> None:
-    """Print what the first frames show to be wrong.
+    """Print the mistakes that the first frames show.
 
     Raises:
-        InputError: their LiDAR points lie elsewhere, which would ruin cars that are right without them.
+        InputError: LiDAR points do not match the images, which would spoil cars that are right without them.
     """
     findings, _ = check_frames(dataset, dataset.frame_ids[:_CHECKED_FRAMES], match_images=False)
     for finding in by_severity(findings):
-        # Which frame cannot be read, or has no cars, the run says itself, and goes on with the others.
+        # The run itself reports frames that cannot be read or have no cars, and continues.
         if finding.check not in SAID_BY_THE_RUN:
             print(f"check: {finding} ('directshape check-data' looks closer)", file=sys.stderr)
         if finding.check == "lidar_elsewhere" and finding.severity == "error":
@@ -166,12 +166,11 @@ def _warn_of(dataset: StereoDataset) -> None:
 
 
 def _rigs_of_run(dataset: StereoDataset, rig: str, out_dir: Path, fresh: bool) -> tuple[list[RigEstimate], bool]:
-    """The estimates that `--rig` names, and whether they are new: those of a file, or of the run's folder, made where
-    there are none."""
+    """The estimates that `--rig` names, from a file or the run's folder or made now, and whether they are new."""
     if rig != "auto":
         return known_rigs(rig), False
     path = out_dir / RIG_FILE
-    # Whatever lies there is not overwritten, unless it is an estimate.
+    # An existing file is only overwritten if it is an estimate.
     kept = load_rigs(path) if path.is_file() else None
     if kept is not None and not fresh:
         for estimate in kept:
@@ -185,7 +184,7 @@ def _rigs_of_run(dataset: StereoDataset, rig: str, out_dir: Path, fresh: bool) -
 
 
 def _learn(dataset: StereoDataset, refiner: DirectShapeRefiner, rigs: RigEstimates) -> None:
-    """Let the rigs learn what the detector is off by where they do not know it, and print it."""
+    """Let the rigs learn the errors of the detector, unless they know them, and print these."""
     if rigs.detector_sigmas() is None:
         with Bar(desc="detector", unit="frame") as bar:
             learn_detector(dataset, refiner, rigs, lambda _: bar.update())
@@ -201,7 +200,7 @@ def _say_where_rigs_are_guesses(rigs: Sequence[RigEstimate]) -> None:
 
 
 class _Progress(ProgressBar):
-    """Also writes new estimates, once the folder is this run's: one that is refused leaves it as it was."""
+    """A `_Progress` also writes new rig estimates when the run starts; a refused run leaves the folder unchanged."""
 
     def __init__(self, out_dir: Path, new_rigs: list[RigEstimate] | None) -> None:
         super().__init__()

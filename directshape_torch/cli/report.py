@@ -1,9 +1,9 @@
 """`directshape report`: write an HTML page about a run.
 
 Write one self-contained HTML page about a run of 'directshape refine': summary, sortable table of cars, distributions,
-best and worst cars, pictures before and after, residual maps, and a 3D view of each frame. It opens from the disk,
-without a network. Images, detections and masks are not in the run's folder: name them as for 'refine'; those that have
-changed since are not used, and what is missing the page says.
+best and worst cars, pictures before and after, residual maps, and a 3D view of each frame. The page opens from the
+disk, without a network. Images, detections and masks are not in the run's folder, so name them as for 'refine'. Files
+that have changed since are not used, and the page says what is missing.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from directshape_torch.report.make_report import make_report
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The run, its inputs, and what is shown."""
+    """Add the options of the run, its inputs and what is shown."""
     parser.add_argument("out", type=Path, metavar="OUT", help="the folder of --out of 'directshape refine'")
     parser.add_argument("--html", type=Path, metavar="FILE", help="the page (default: OUT/report.html)")
     add_run_inputs(parser.add_argument_group("inputs of the run"), "for pictures and residual maps")
@@ -31,7 +31,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the page and say how large it is."""
+    """Write the page and print its size."""
     run_folder = RunFolder(args.out, args.frames)
     page = args.out / "report.html" if args.html is None else args.html
     inputs = inputs_of_run(args, run_folder)

@@ -1,7 +1,7 @@
 """`directshape status`: how far a run is.
 
-Tell what a run has done, what failed and what is left, while it goes on or after it ended. Only reads; may be asked as
-often as you like, from any machine that sees the folder. Exit code: 0, or 2 where no run has been.
+Show what a run has done, what failed and what is left, while it runs or after its end. The command only reads, so it
+may be used at any time, from any machine that has the folder. The exit code is 0, or 2 if there was no run.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from directshape_torch.batch.run_status import format_status, read_status
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The folder, and a form for programs."""
+    """Add the options of the folder and of a form for programs."""
     parser.add_argument("out", type=Path, metavar="DIR", help="output folder of directshape refine")
     parser.add_argument("--json", action="store_true", help="for programs: one object with all that is known")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read and print."""
+    """Read the status and print it."""
     status = read_status(args.out)
     if args.json:
         print(json.dumps({**asdict(status), "num_left": status.num_left}, indent=2, sort_keys=True))
