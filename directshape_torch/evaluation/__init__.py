@@ -1,1 +1,1 @@
-"""Results against labels: KITTI's scores, what a refinement changed, matching, errors, overlaps, confidence."""
+"""This package compares results with labels: KITTI's scores, changes by a refinement, matching, errors and IoU."""

@@ -1,4 +1,4 @@
-"""Confidence intervals by drawing cars again."""
+"""This module estimates confidence intervals by bootstrap over cars."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from directshape_torch.errors import InputError
 
 Statistic = Callable[..., Any]
-"""`numpy.mean` or `numpy.median`, or another that takes values and an axis."""
+"""This is `numpy.mean`, `numpy.median` or another function of values and an axis."""
 
 _PERCENTILES = (2.5, 97.5)
 _MOST_ELEMENTS = 4_000_000
@@ -20,7 +20,7 @@ _MOST_ELEMENTS = 4_000_000
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure and its confidence interval; `low` and `high` are None where there are fewer than two cars."""
+    """An `Estimate` is a figure with its confidence interval; `low` and `high` are None for fewer than two cars."""
 
     value: float
     low: float | None
@@ -29,7 +29,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class MetricSummary:
-    """One figure before, after, and the change with an interval of its own (same cars in every draw)."""
+    """A `MetricSummary` is a figure before and after, and its change with an interval from the same draws of cars."""
 
     before: Estimate
     after: Estimate
@@ -37,15 +37,15 @@ class MetricSummary:
 
 
 class CarBootstrap:
-    """Draws of cars with replacement, shared by every figure of one group, so that figures are comparable.
+    """A `CarBootstrap` draws cars with replacement, with shared draws for all figures of a group.
 
     Args:
-        num_cars: N, at least 1.
-        num_draws: at least 1.
-        seed: of the draws.
+        num_cars: number of cars N, at least 1.
+        num_draws: number of draws, at least 1.
+        seed: seed of the draws.
 
     Raises:
-        InputError: no cars, or no draws.
+        InputError: there are no cars or no draws.
 
     Examples:
         >>> CarBootstrap(4).estimate(np.ones(4))
@@ -65,13 +65,13 @@ class CarBootstrap:
     def summary(
         self, before: NDArray[np.float64], after: NDArray[np.float64], statistic: Statistic = np.mean
     ) -> MetricSummary:
-        """Statistics of `before` and `after` (N,), and of the second less the first, of the same cars in every draw."""
+        """Statistics of `before` and `after` (N,), and of their difference, over the same cars in every draw."""
         values, drawn = [statistic(x) for x in (before, after)], [self._drawn(x, statistic) for x in (before, after)]
         first, second = map(self._interval, values, drawn)
         return MetricSummary(first, second, self._interval(values[1] - values[0], drawn[1] - drawn[0]))
 
     def _drawn(self, values: NDArray[np.float64], statistic: Statistic) -> NDArray[np.float64]:
-        # Some draws at a time, to bound the memory for thousands of cars.
+        # The draws are processed in parts, to bound the memory for thousands of cars.
         parts = np.array_split(self._draws, 1 + self._draws.size // _MOST_ELEMENTS)
         return np.concatenate([statistic(values[rows], axis=1) for rows in parts])
 

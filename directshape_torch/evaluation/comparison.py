@@ -1,4 +1,4 @@
-"""Result files before and after a refinement, judged against labels, with confidence intervals over cars."""
+"""This module compares result files before and after a refinement with labels, with confidence intervals over cars."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from directshape_torch.io.kitti_labels import KittiObject, objects_in, objects_p
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.refinement.trust import WORSE_BY
 
-# Depth of the label along the optical axis, metres; the last bin is open.
+# These are depths of the label along the optical axis, metres; the last bin is open.
 _DEPTH_BINS_M = (0.0, 10.0, 20.0, 30.0, 45.0, float("inf"))
 
 
 @dataclass(frozen=True)
 class ComparedCar:
-    """One detection with its label, before and after."""
+    """A `ComparedCar` is one detection with its label, before and after."""
 
     frame_id: str  # the frame
     detection_line: int  # line of both result files, from 1
     label_line: int  # line of the label file, from 1
     depth_m: float  # of the label's box along the optical axis, metres
     height_px: float  # of the label's 2D box
-    score: float | None  # the detector's, or None
-    before: CarErrors  # errors of the two boxes
+    score: float | None  # confidence of the detector, or None
+    before: CarErrors  # errors of both boxes
     after: CarErrors
 
 
 class Metric(NamedTuple):
-    """How one figure is made: a value for each car, and the statistic over cars."""
+    """A `Metric` defines one figure: a value for each car, and the statistic over cars."""
 
     key: str
     label: str
@@ -65,24 +65,24 @@ METRICS = (
 
 @dataclass(frozen=True)
 class GroupSummary:
-    """Figures of a group of detections."""
+    """A `GroupSummary` has the figures of a group of detections."""
 
     name: str  # of the group
-    num_detections: int  # n, detections compared
+    num_detections: int  # number of compared detections
     metrics: dict[str, MetricSummary]  # by `Metric.key`; empty for an empty group
     worse_share: Estimate | None  # share of detections whose BEV IoU fell by more than 0.05; None for an empty group
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Everything `compare_results` finds."""
+    """A `Comparison` is the result of `compare_results`."""
 
     cars: tuple[ComparedCar, ...]  # every counted label with a detection, in the order of frames and detection lines
     overall: GroupSummary  # figures over detections
     by_depth: tuple[GroupSummary, ...]  # figures for bins of the label's depth
     num_frames: int  # frames compared
     num_labels_counted: int  # labels that count, found by a detection or not
-    num_filtered_out: int  # found labels whose detection had no mask, where only those with one count
+    num_filtered_out: int  # found labels left out because their detection had no mask, if only masked ones count
 
 
 def compare_results(
@@ -100,19 +100,19 @@ def compare_results(
 
     Args:
         labels_dir: folder of KITTI labels `NNNNNN.txt` (usually `training/label_2`), or of the tracking benchmark: a
-            folder of `SEQUENCE.txt`, for frames called `SEQUENCE_NNNNNN`, or the file of a single sequence.
-        before_dir, after_dir: result files in the same forms, or a folder `data` of them below. The files of a frame
-            have the same lines in the same order; a detection takes its label by the 2D box of `before`.
-        split: file with one frame id a line; default every frame of `before_dir`; where that is of the tracking
-            benchmark, those of `after_dir`.
-        frames: ids or numbers of the frames to compare, of those.
-        shapes_dir: `OUT/shapes` of the refinement, or `OUT`: leaves out detections that had no left mask, and lines
-            that were only copied; they still take their labels.
-        num_draws, seed: of the confidence intervals.
+            folder of `SEQUENCE.txt`, for frames with names `SEQUENCE_NNNNNN`, or the file of a single sequence.
+        before_dir, after_dir: result files in the same forms, or in a subfolder `data`. The files of a frame have the
+            same lines in the same order. A detection is matched to its label by the 2D box of `before`.
+        split: file with one frame id in each line. Default: every frame of `before_dir`, or every frame of `after_dir`
+            if `before_dir` has files of the tracking benchmark.
+        frames: ids or numbers of the frames to compare, out of the split.
+        shapes_dir: `OUT/shapes` of the refinement, or `OUT`. Detections without a left mask and copied lines are then
+            left out, although they still take part in the matching.
+        num_draws, seed: parameters of the confidence intervals.
 
     Raises:
-        DataFormatError: a file is missing or damaged, or the two result files of a frame do not have the same lines.
-        InputError: no frames.
+        DataFormatError: a file is missing or damaged, or the two result files of a frame have different lines.
+        InputError: there are no frames.
     """
     sources = Path(labels_dir), Path(before_dir), Path(after_dir)
     known = _frames_of(*sources[1:])
@@ -152,7 +152,7 @@ def compare_results(
 def _summarised(name: str, cars: Sequence[ComparedCar], num_draws: int, seed: int) -> GroupSummary:
     if not cars:
         return GroupSummary(name, 0, {}, None)
-    # By label, so that the draws do not depend on the order of the detections.
+    # The order by label makes the draws independent of the order of the detections.
     cars = sorted(cars, key=lambda car: f"{car.frame_id}:{car.label_line}")
     bootstrap = CarBootstrap(len(cars), num_draws, seed)
     metrics = {}
@@ -164,7 +164,7 @@ def _summarised(name: str, cars: Sequence[ComparedCar], num_draws: int, seed: in
 
 
 def _frames_of(before: Path, after: Path) -> tuple[str, ...]:
-    """The frames to compare: every file of `before`, but those that `after` has of a file or folder of a sequence."""
+    """The frames to compare: all of `before`, but the frames in `after` for a file or folder of a sequence."""
     results = files_of_frames(after)
     if before.is_file():
         return tuple(results)
@@ -173,13 +173,13 @@ def _frames_of(before: Path, after: Path) -> tuple[str, ...]:
         of_sequence.setdefault(stem.rpartition("_")[0], []).append(stem)
     files, folders = set(files_of_frames(before)), {path.name for path in before.iterdir() if path.is_dir()}
     sequences = of_sequence.keys() & (files | folders)
-    # A file whose name has neither a digit nor results, README.txt, is no frame.
+    # A file without a digit in its name and without results, such as README.txt, is not a frame.
     alone = {name for name in files - sequences if name in results or any(map(str.isdigit, name))}
     return tuple(frame for name in sorted(sequences | alone) for frame in of_sequence.get(name, [name]))
 
 
 def _cars_of_frame(sources: tuple[Path, Path, Path], frame_id: str) -> tuple[list[ComparedCar], int]:
-    """Counted labels of a frame that have a detection, and the number of those that count at all."""
+    """Counted labels of a frame that have a detection, and the number of all counted labels."""
     before_path, after_path = (objects_path(source, frame_id) for source in sources[1:])
     labels = objects_of_frame(sources[0], frame_id, are_labels=True)
     if not after_path.is_file():

@@ -1,4 +1,4 @@
-"""Shapes before and after a refinement against true surfaces, car by car."""
+"""This module compares shapes before and after a refinement with true surfaces, car by car."""
 
 from __future__ import annotations
 
@@ -27,40 +27,40 @@ from directshape_torch.shape.shape_prior import ShapePrior
 
 @dataclass(frozen=True)
 class EvaluatedCar:
-    """One label with a detection and a true surface."""
+    """An `EvaluatedCar` is one label with a detection and a true surface."""
 
     frame_id: str  # the frame
-    detection_line: int  # lines of their files, from 1
+    detection_line: int  # lines of the detection and the label file, from 1
     label_line: int
-    status: str  # how the refinement of the car ended
+    status: str  # status of the refinement of the car
     depth_m: float  # of the label's box along the optical axis, metres
-    segment: str  # which pixels of the left image are the car's
+    segment: str  # pixels of the left image that belong to the car, in words
     before: ShapeError  # errors of the mean shape at the pose of the detection
     after: ShapeError  # errors of the refined shape
 
 
 @dataclass(frozen=True)
 class ShapeCurve:
-    """One metric over tau: its mean over cars."""
+    """A `ShapeCurve` is the mean of one metric over cars, as a function of tau."""
 
     metric: str  # "completeness", "accuracy", "f1" (shares) or "rmse_m" (metres)
     taus_m: tuple[float, ...]  # (T,) metres
-    # (T,) cars in the mean: all, or for RMSE those with a matched point both before and after.
+    # (T,) number of cars in the mean; for RMSE only cars with a matched point both before and after.
     num_cars: tuple[int, ...]
-    summaries: tuple[MetricSummary | None, ...]  # (T,) before, after and change; None where there is no such car
+    summaries: tuple[MetricSummary | None, ...]  # (T,) before, after and change; None if there is no such car
 
 
 @dataclass(frozen=True)
 class ShapeScores:
-    """Everything `evaluate_shapes` finds."""
+    """A `ShapeScores` is the result of `evaluate_shapes`."""
 
     cars: tuple[EvaluatedCar, ...]  # in the order of frames and detection lines
     curves: tuple[ShapeCurve, ...]  # one for each of `METRICS`
     num_frames: int  # frames evaluated
-    num_labels_counted: int  # labels that count in these frames
-    num_without_truth: int  # of these, labels without a true surface: no mask, or no known depth in it
-    num_without_detection: int  # of the others, labels that no detection was refined for
-    mean_num_true: float  # true points a car, mean
+    num_labels_counted: int  # counted labels of these frames
+    num_without_truth: int  # counted labels without a true surface, for lack of a mask or of known depths in it
+    num_without_detection: int  # other counted labels without a refined detection
+    mean_num_true: float  # mean number of true points of a car
 
 
 METRICS = ("completeness", "accuracy", "f1", "rmse_m")
@@ -79,27 +79,28 @@ def evaluate_shapes(
     num_draws: int = 2000,
     seed: int = 0,
 ) -> ShapeScores:
-    """Completeness, accuracy, F1 and RMSE (see `shape_error`) of the input and of the output of a refinement.
+    """Completeness, accuracy, F1 and RMSE (see `shape_error`) before and after a refinement.
 
-    Each car has one vote: figures are means over cars of the figure of each car. The paper does not say whether it
-    averages cars or points; with points, near cars would decide alone. Cars without any matched point have no RMSE and
-    are left out of its mean. Labels without a detection are counted and left out: a refinement cannot find them.
+    Each car has the same weight: figures are means over cars. The paper does not say whether it averages cars or
+    points; averages over points would be dominated by near cars. Cars without any matched point have no RMSE and are
+    left out of its mean. Labels without a detection are counted and left out, because a refinement cannot find them.
 
     Args:
-        data_dir: folder that holds `training` with calib and the truth: `disp_occ_0` (KITTI Stereo 2015) or `depth_2`.
-        detections_dir: result files that went into the refinement; "before" is the mean shape at their poses.
+        data_dir: folder with `training` that contains calib and the truth: `disp_occ_0` (KITTI Stereo 2015) or
+            `depth_2`.
+        detections_dir: input files of the refinement; "before" is the mean shape at their poses.
         refined_dir: output folder of `directshape refine`, with `shapes`.
-        prior: the one that the refinement used; shapes of another one are refused.
-        masks: the segments: a folder (see `mask_source`) or a source. One ray is cast for each pixel of a car's segment
-            whose true depth is known.
-        labels_dir: default `training/label_2`.
-        split: file with one frame id a line; default all that have both shapes and truth.
-        frames: ids of the frames, or their numbers, of those.
-        num_draws, seed: of the confidence intervals, which are over cars.
+        prior: the prior of the refinement; shapes of another prior are refused.
+        masks: segments of the cars: a folder (see `mask_source`) or a source. One ray is cast for each pixel of a car's
+            segment with known true depth.
+        labels_dir: folder of labels. Default: `training/label_2`.
+        split: file with one frame id in each line. Default: all frames that have both shapes and truth.
+        frames: ids or numbers of the frames to use, out of the split.
+        num_draws, seed: parameters of the confidence intervals, which are over cars.
 
     Raises:
         DataFormatError: a file is missing or damaged, or belongs to another prior.
-        InputError: nothing to evaluate.
+        InputError: there is nothing to evaluate.
     """
     training = Path(data_dir) / "training"
     if not training.is_dir():
@@ -157,14 +158,14 @@ def _chosen(inputs: _Inputs, frames: Iterable[str | int] | None, split: Path | s
 
 
 def _evaluated(inputs: _Inputs, frame_id: str) -> tuple[list[EvaluatedCar], int, int]:
-    """The cars of a frame, how many labels count, and how many of these have a true surface."""
+    """The cars of a frame, the number of counted labels, and the number of these with a true surface."""
     name, prior = f"{frame_id}.txt", inputs.prior
     camera = to_stereo_camera(read_calibration(inputs.training / "calib" / name))
     labels, detections = (
         read_objects(file_of_frame(folder, name)) for folder in (inputs.labels_dir, inputs.detections_dir)
     )
     shapes = _shapes(inputs, frame_id, len(detections))
-    # All labels compete for a mask, so that one that does not count keeps its own.
+    # All labels compete for masks, so that a label that does not count still takes its own mask.
     in_space = [label for label in labels if label.has_box_3d]
     truths = segments_of(inputs.maps / f"{frame_id}.png", inputs.masks, in_space, camera)
     row_of_line = {line: row for row, line in enumerate(shapes.input_lines.tolist())}

@@ -1,4 +1,4 @@
-"""Average precision and orientation similarity of 3D object detections, by the rules of KITTI's own evaluation."""
+"""This module computes KITTI's average precision and orientation similarity of 3D object detections."""
 
 from __future__ import annotations
 
@@ -20,39 +20,39 @@ MINIMUM_IOUS = (0.7, 0.5)
 
 @dataclass(frozen=True)
 class ApScore:
-    """Scores of one metric at one overlap and difficulty, in percent."""
+    """An `ApScore` has the scores of one metric at one IoU and difficulty, in percent."""
 
     metric: Metric  # 2d (image boxes), bev (bird's-eye view) or 3d
-    minimum_iou: float  # a detection is right if it overlaps its label by more than this
+    minimum_iou: float  # a detection is correct if its IoU with its label is larger
     difficulty: str  # easy, moderate or hard
-    num_labels: int  # labels that count
+    num_labels: int  # number of counted labels
     ap_r11: float  # average precision over 11 and over 40 recall points
     ap_r40: float
-    # Area under the same curve over its true recalls; for sets of fewer than 41 labels, where the devkit's recall
-    # points cannot all be reached and both figures above fall short.
+    # Area under the same curve over its true recalls. With fewer than 41 labels the devkit's recall points cannot all
+    # be reached, and both other figures are too low.
     ap_area: float
-    aos_r11: float | None  # average orientation similarity, of 2d alone; None where the results carry no alpha
+    aos_r11: float | None  # average orientation similarity, for 2d only; None if results have no alpha
     aos_r40: float | None
-    curve: Curve  # what the figures are made of
+    curve: Curve  # the curve behind the figures
 
 
 @dataclass(frozen=True)
 class KittiScores:
-    """Everything `evaluate_kitti` finds."""
+    """A `KittiScores` is the result of `evaluate_kitti`."""
 
-    object_type: str  # the class
+    object_type: str  # evaluated class
     num_frames: int  # frames evaluated
     num_detections: int  # detections of the class in the evaluated frames
-    # For every metric, overlap and difficulty; bev and 3d are left out where no detection has a 3D box.
+    # Scores of every metric, IoU and difficulty; bev and 3d are absent if no detection has a 3D box.
     scores: tuple[ApScore, ...]
-    num_frames_without_results: int = 0  # those of the frames that have no result file; their labels are missed
-    num_result_frames_unused: int = 0  # frames that have results and are not evaluated
+    num_frames_without_results: int = 0  # frames without a result file; their labels count as missed
+    num_result_frames_unused: int = 0  # frames with results that are not evaluated
 
     def score(self, metric: str, minimum_iou: float, difficulty: str) -> ApScore:
-        """The scores of one cell.
+        """The scores of one metric, IoU and difficulty.
 
         Raises:
-            InputError: there is no such cell; names those that there are.
+            InputError: there are no such scores; the error lists the known values.
         """
         cells = {(s.metric, s.minimum_iou, s.difficulty): s for s in self.scores}
         if (wanted := (metric, minimum_iou, difficulty)) not in cells:
@@ -73,16 +73,16 @@ def evaluate_kitti(
 
     Args:
         labels_dir: folder of KITTI labels `NNNNNN.txt` (usually `training/label_2`).
-        results_dir: folder of result files `NNNNNN.txt` with scores, or above a folder `data` with them. A frame
-            without results counts as missed.
-        split: file with one frame id a line; default every frame that has labels.
-        frames: ids of the frames, or their numbers, of those.
-        object_type: the class to score; labels of its neighbour (Van for Car) are ignored.
+        results_dir: folder of result files `NNNNNN.txt` with scores, or the folder above `data` with them. All labels
+            of a frame without results count as missed.
+        split: file with one frame id in each line. Default: every frame that has labels.
+        frames: ids or numbers of the frames to use, out of the split.
+        object_type: class to score; labels of its neighbour (Van for Car) are ignored.
 
     Raises:
         DataFormatError: a folder, a label file of the split or a line is missing or damaged, or a result has no score.
-        InputError: no frame has labels, or none has results, or the class occurs in neither, or no detection has a
-            2D box.
+        InputError: no frame has labels, or none has results, or the class occurs in neither, or no detection has a 2D
+            box.
     """
     labels, results = _files(labels_dir, "labels"), _files(results_dir, "results")
     if not labels:
@@ -113,7 +113,7 @@ def evaluate_kitti(
 def score_frames(
     frames: Sequence[tuple[Sequence[KittiObject], Sequence[KittiObject]]], object_type: str = "Car"
 ) -> KittiScores:
-    """Score the detections of some frames, each its labels and its results with scores, as `evaluate_kitti` does.
+    """Score detections as `evaluate_kitti` does; each frame is a pair of its labels and its results with scores.
 
     Examples:
         >>> from directshape_torch.io.kitti_labels import parse_object
@@ -158,7 +158,7 @@ def _percent(samples: Floats) -> float:
 def _files(folder: Path | str, name: str) -> dict[str, Path]:
     if not Path(folder).is_dir():
         raise DataFormatError(folder, f"is no folder of {name}", cure="give the folder that holds the files NNNNNN.txt")
-    # The two folders may write accents differently.
+    # The two folders may have file names with different encodings of accents.
     return {composed(name): path for name, path in files_of_frames(Path(folder)).items()}
 
 

@@ -1,4 +1,4 @@
-"""The rules of KITTI's own evaluation (devkit of 2017): what counts, what overlaps, and precision over recall."""
+"""This module has the rules of KITTI's evaluation (devkit of 2017): counting, overlap, and precision over recall."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ Flags = NDArray[np.bool_]
 Metric = Literal["2d", "bev", "3d"]
 
 NUM_RECALL_POINTS = 41
-# Finding one of these is neither right nor wrong: they look like the class, and some are labelled as the one or other.
+# A detection of the neighbour class counts as neither right nor wrong, because the two classes look alike.
 _NEIGHBOUR = {"car": "van", "pedestrian": "person_sitting"}
 _DONT_CARE = "dontcare"
-# KITTI's mark of a result without an observation angle.
+# KITTI writes this for a result without an observation angle.
 _NO_ALPHA = -10.0
 
 
 class Difficulty(NamedTuple):
-    """What a label must be to count."""
+    """A `Difficulty` says which labels count."""
 
     name: str
-    minimum_height_px: float  # of the 2D box; a label must be higher, a detection at least as high
+    minimum_height_px: float  # of the 2D box; the height of a label must be larger, of a detection at least as large
     maximum_occluded: int  # KITTI's level, 0 visible, 1 partly, 2 largely occluded
     maximum_truncated: float  # share of the object outside the image
 
@@ -41,22 +41,22 @@ DIFFICULTIES = (Difficulty("easy", 40, 0, 0.15), Difficulty("moderate", 25, 1, 0
 
 @dataclass(frozen=True)
 class Curve:
-    """What is found and what is wrong from each score threshold upwards; T <= 41 thresholds, falling."""
+    """A `Curve` has recall, precision and orientation similarity at T <= 41 score thresholds in descending order."""
 
     thresholds: Floats  # (T,) scores
     recall: Floats  # (T,) share of the counted labels that are found
-    precision: Floats  # (41,) the largest share of right detections at this or any lower threshold; 0 beyond T
-    orientation: Floats | None  # (41,) the same of the orientation similarity; None where results carry no alpha
+    precision: Floats  # (41,) the largest precision at this or any lower threshold; 0 beyond T
+    orientation: Floats | None  # (41,) orientation similarity, likewise; None if results have no alpha
 
 
 class _Objects(NamedTuple):
-    """N labels or detections of all frames as columns."""
+    """An `_Objects` has N labels or detections of all frames as columns."""
 
-    kind: NDArray[np.str_]  # classes in lower case, because the devkit compares them without regard to case
+    kind: NDArray[np.str_]  # classes in lower case, because the devkit ignores case
     truncated: Floats
     occluded: Floats
     alpha: Floats
-    score: Floats  # NaN in labels
+    score: Floats  # NaN for labels
     box_2d: Floats  # (N, 4)
     box_3d: torch.Tensor  # (N, 7), see `boxes_of`
     has_box_3d: Flags
@@ -83,7 +83,7 @@ class _Objects(NamedTuple):
 
 
 class KittiScene:
-    """Labels and detections of one class in all frames, and P pairs of them that overlap.
+    """A `KittiScene` has the labels and detections of one class in all frames, and P overlapping pairs of them.
 
     Args:
         frames: the labels and the detections of each frame.
@@ -100,7 +100,7 @@ class KittiScene:
             first = first + sizes
         label, detection = np.concatenate(pairs, axis=1)
         kind = self.labels.kind[label]
-        # How much of each detection lies in one region that nobody labelled.
+        # The largest share of each detection that lies in a DontCare region.
         self.unlabelled_share = np.zeros(len(self.detections.kind))
         share = self._shared_2d(label[kind == _DONT_CARE], detection[kind == _DONT_CARE], of_detection=True)
         np.maximum.at(self.unlabelled_share, detection[kind == _DONT_CARE], share)
@@ -108,7 +108,7 @@ class KittiScene:
         self.label, self.detection, self.iou = self._overlapping(label[is_wanted], detection[is_wanted])
 
     def _overlapping(self, label: Indices, detection: Indices) -> tuple[Indices, Indices, dict[Metric, Floats]]:
-        """Of some pairs those that overlap in some way (P,), and how much by metric."""
+        """The pairs (P,) that overlap in the image or from above, and their IoU by metric."""
         in_image, is_near = self._shared_2d(label, detection), self._may_touch(label, detection)
         kept = is_near | (in_image > 0)
         label, detection, is_near = label[kept], detection[kept], is_near[kept]
@@ -119,7 +119,7 @@ class KittiScene:
         return label, detection, iou
 
     def _shared_2d(self, label: Indices, detection: Indices, of_detection: bool = False) -> Floats:
-        """Intersection of image boxes (P,) as continuous areas, over their union or over the detection alone."""
+        """Intersection of image boxes (P,) as continuous areas, divided by their union or by the detection's area."""
         a, b = self.labels.box_2d[label], self.detections.box_2d[detection]
         sides = np.minimum(a[:, 2:], b[:, 2:]) - np.maximum(a[:, :2], b[:, :2])
         shared = np.where((sides > 0).all(axis=1), sides.prod(axis=1), 0.0)
@@ -128,7 +128,7 @@ class KittiScene:
         return np.asarray(np.divide(shared, whole, out=np.zeros_like(shared), where=whole > 0))
 
     def _may_touch(self, label: Indices, detection: Indices) -> Flags:
-        """Whether the circles around two footprints meet (P,); the exact overlap is computed for these alone."""
+        """Whether the circles around two footprints intersect (P,); only then the exact IoU is computed."""
         a, b = self.labels.box_3d[label].numpy(), self.detections.box_3d[detection].numpy()
         distance, reach = np.hypot(*(a - b)[:, [0, 2]].T), np.hypot(*a[:, 4:6].T) + np.hypot(*b[:, 4:6].T)
         both = self.labels.has_box_3d[label] & self.detections.has_box_3d[detection]
@@ -136,52 +136,52 @@ class KittiScene:
 
     @property
     def has_box_3d(self) -> bool:
-        """Whether a detection of the class has a 3D box, or there is none at all."""
+        """Whether a detection of the class has a 3D box; True without any detection of the class."""
         mine = self.detections.kind == self.kind
         return bool(self.detections.has_box_3d[mine].any() or not mine.any())
 
     def counted_labels(self, difficulty: Difficulty) -> tuple[Flags, Flags]:
-        """Labels that must be found, and those that may be: of the class but too hard, or of its neighbour."""
+        """Labels that must be found, and labels that may be: of the class but too hard, or of the neighbour class."""
         labels = self.labels
         too_hard = (
             (labels.occluded > difficulty.maximum_occluded)
             | (labels.truncated > difficulty.maximum_truncated)
-            # A label of exactly the least height is ignored, a detection is not; both as in the devkit.
+            # A label of exactly the minimum height is ignored, but a detection of that height counts, as in the devkit.
             | (labels.height_px <= difficulty.minimum_height_px)
         )
         mine = labels.kind == self.kind
         return mine & ~too_hard, (mine & too_hard) | (labels.kind == _NEIGHBOUR.get(self.kind, ""))
 
     def curve(self, metric: Metric, minimum_iou: float, difficulty: Difficulty) -> Curve:
-        """Precision over recall (devkit: `eval_class`)."""
+        """Precision over recall (`eval_class` of the devkit)."""
         must, may = self.counted_labels(difficulty)
         detections = self.detections
-        # A detection that is too small is ignored whatever its class: the devkit asks for the height first.
+        # A detection that is too small is ignored whatever its class, because the devkit checks the height first.
         is_small = np.abs(detections.height_px) < difficulty.minimum_height_px
         counts = (detections.kind == self.kind) & ~is_small
         enough = self.iou[metric] > minimum_iou
         enough &= (must | may)[self.label] & (counts | is_small)[self.detection]
         label, detection, iou = self.label[enough], self.detection[enough], self.iou[metric][enough]
         is_right, score = must[label] & counts[detection], detections.score
-        # Of all that overlap enough the highest score is preferred while thresholds are sought ..
+        # While thresholds are sought, the highest score of all overlapping detections is preferred.
         found, _ = assign(label, detection, -score[detection], np.ones((len(score), 1), dtype=bool))
         thresholds = score_thresholds(score[detection[found[:, 0] & is_right]], int(must.sum()))
-        # .. and then the largest overlap, an ignored detection only where there is no other.
+        # Then the largest IoU is preferred, and an ignored detection is taken only if there is no other.
         preference = np.where(is_small[detection], np.inf, -iou)
         chosen, free = assign(label, detection, preference, score[:, None] >= thresholds)
         chosen &= is_right[:, None]
         may_be_wrong = counts
         if metric == "2d":
-            # Seen from above and in space an unlabelled region has no place, so that no detection lies in one.
+            # DontCare regions are defined only in the image, so they do not apply to bev and 3d.
             may_be_wrong = counts & (self.unlabelled_share <= minimum_iou)
         num_right = chosen.sum(axis=0)
         num_positive = num_right + (free & may_be_wrong[:, None]).sum(axis=0)
-        # One result without alpha suffices to leave the orientation out, as in the devkit.
+        # One result without alpha is enough to leave out the orientation, as in the devkit.
         has_alpha = metric == "2d" and not (detections.alpha == _NO_ALPHA).any()
         similarity = 0.5 + 0.5 * np.cos(self.labels.alpha[label] - detections.alpha[detection])
         return Curve(
             thresholds,
-            # Labels that only an ignored detection covers stay in the denominator, as when thresholds are chosen.
+            # Labels that only an ignored detection covers stay in the denominator, as for the choice of thresholds.
             num_right / max(int(must.sum()), 1),
             _envelope(num_right / np.maximum(num_positive, 1)),
             _envelope(similarity @ chosen / np.maximum(num_positive, 1)) if has_alpha else None,
@@ -189,14 +189,14 @@ class KittiScene:
 
 
 def assign(
-    label: Indices,  # (P,) numbers of labels, ascending as they stand in the files
+    label: Indices,  # (P,) numbers of labels, ascending in the order of the files
     detection: Indices,  # (P,)
-    preference: Floats,  # (P,) of each label for its detections, least first; equal ones: first in the file
-    taking_part: Flags,  # (D, T) detections at each threshold
-) -> tuple[Flags, Flags]:  # (P, T) pairs that belong together, (D, T) detections that nobody took
-    """Give each label in turn the free detection that it prefers, of the P pairs whose overlap suffices.
+    preference: Floats,  # (P,) order of the detections of each label, least first; ties go to the first in the file
+    taking_part: Flags,  # (D, T) detections in use at each threshold
+) -> tuple[Flags, Flags]:  # (P, T) assigned pairs, (D, T) unassigned detections
+    """Assign to each label in turn the free detection that it prefers, out of the P pairs with enough overlap.
 
-    Example: both labels want detection 0; the second one gets what is left.
+    Example: both labels want detection 0, and the second label gets the other one.
         >>> label, detection, preference = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1]), np.array([0.1, 0.2] * 2)
         >>> assign(label, detection, preference, np.ones((2, 1), dtype=bool))[0][:, 0]
         array([ True, False, False,  True])
@@ -213,14 +213,14 @@ def assign(
 
 
 def score_thresholds(scores: Floats, num_labels: int) -> Floats:
-    """The scores at which recall comes closest to 0, 1/40, .., 1 (devkit: `getThresholds`).
+    """The scores at which recall is closest to 0, 1/40, .., 1 (`getThresholds` of the devkit).
 
     Args:
-        scores: of the labels that are found when every detection takes part.
+        scores: scores of the labels that are found if all detections are used.
         num_labels: number of counted labels.
 
     Returns:
-        At most 41 scores, falling; fewer than 41 labels give no more scores than labels.
+        At most 41 scores in descending order; fewer than 41 labels give at most as many scores as labels.
 
     Examples:
         >>> score_thresholds(np.array([0.2, 0.9]), num_labels=3)
@@ -238,7 +238,7 @@ def score_thresholds(scores: Floats, num_labels: int) -> Floats:
 
 
 def _envelope(values: NDArray[Any]) -> Floats:
-    """Filled with zeros to 41, and each replaced by the largest that follows (41,)."""
+    """Values (41,), padded with zeros, each replaced by the largest value from there on."""
     padded = np.zeros(NUM_RECALL_POINTS)
     padded[: len(values)] = values
     return np.asarray(np.maximum.accumulate(padded[::-1])[::-1])

@@ -1,4 +1,4 @@
-"""Which frames are judged, which detection belongs to which label, and which labels count."""
+"""This module chooses the frames to evaluate, matches detections to labels, and decides which labels count."""
 
 from __future__ import annotations
 
@@ -16,15 +16,17 @@ from directshape_torch.io.frame_layout import frames_among, frames_of_split
 from directshape_torch.io.kitti_labels import KittiObject, objects_in, objects_path, own_boxes_2d
 
 _MINIMUM_IOU_2D = 0.3
-# Within which a detection without a 2D box takes a label, metres along the ground; and one whose 2D box touches no
-# label's: cars whose middles are less than half a width apart overlap in any image, so that this box is of no use.
+# A detection without a 2D box is matched to a label within the first distance along the ground, metres. A detection
+# whose 2D box touches no label's is matched within the second distance: cars whose centres are less than half a width
+# apart overlap in every image, so its 2D box must be wrong.
 _REACH_M, _CERTAIN_REACH_M = 4.0, 0.8
-# Of labels that count: KITTI's level 1 is partly occluded; the share outside of the image.
+# Labels count within these limits: the height, KITTI's occlusion level (1 is partly occluded), and the share outside
+# the image.
 _LEAST_HEIGHT_PX, _MOST_OCCLUDED, _MOST_TRUNCATED = 25.0, 1, 0.5
 
 
 def is_counted(label: KittiObject, types: Collection[str] = ("Car",)) -> bool:
-    """Whether a label is of the class, and can fairly be asked of an image: 25 px high, mostly visible."""
+    """Whether a label has the class and can be expected to be found in an image: 25 px high and mostly visible."""
     return (
         label.type in types
         and label.has_box_3d
@@ -35,20 +37,20 @@ def is_counted(label: KittiObject, types: Collection[str] = ("Car",)) -> bool:
 
 
 def match_to_labels(detections: Sequence[KittiObject], labels: Sequence[KittiObject]) -> dict[int, KittiObject]:
-    """The label of each detection that has one, by its place: largest 2D overlap of at least 0.3 first, one to one.
+    """The label of each matched detection, by the detection's index: largest 2D IoU of at least 0.3 first, one to one.
 
-    A detection without a 2D box takes the nearest label within 4 m instead: LiDAR detectors write one without an area,
-    at the corner of the image, or the same for all detections. Another one whose 2D box touches no label's takes a
-    label within 0.8 m. Labels of every class with a 3D box compete, so that a detection of a van is not given to the
-    car behind it; which of the matched labels count is another question (`is_counted`). Of equal overlaps the first
-    detection's is taken.
+    A detection without a 2D box is matched to the nearest label within 4 m. (LiDAR detectors write a box without an
+    area, at the corner of the image, or the same box for all detections.) A detection whose 2D box touches no label's
+    is matched to a label within 0.8 m. Labels of every class with a 3D box compete, so that a detection of a van is not
+    matched to the car behind it; `is_counted` decides which of the matched labels count. For equal IoU the first
+    detection is taken.
     """
     known = [label for label in labels if label.has_box_3d]
     boxes = own_boxes_2d(detections)
     overlap = box_iou(boxes, _image_boxes(known))
     touches = (overlap > 0).any(axis=1, keepdims=True)
     reach_m = np.where((boxes[:, 2:] > boxes[:, :2]).all(axis=1), _CERTAIN_REACH_M, _REACH_M)
-    # Above all closenesses, so that 2D overlaps come first.
+    # 2D IoUs get values above all closenesses, so that they come first.
     overlap = np.where(
         touches, np.where(overlap >= _MINIMUM_IOU_2D, 1 + overlap, 0), _closeness(detections, known, reach_m)
     )
@@ -67,7 +69,7 @@ def _closeness(
     labels: Sequence[KittiObject],
     reach_m: NDArray[np.float64],  # (B,)
 ) -> NDArray[np.float64]:
-    """One (B, L) at the place of a label, and the least overlap at the end of the reach."""
+    """Closeness (B, L), which is 1 at the position of a label and the minimum IoU at the end of the reach."""
     places = [np.array([o.location_ref for o in some]).reshape(-1, 3)[:, [0, 2]] for some in (detections, labels)]
     distance = np.linalg.norm(places[0][:, None] - places[1][None], axis=-1)
     return np.asarray((1 - (1 - _MINIMUM_IOU_2D) * distance / reach_m[:, None]).clip(0))
@@ -78,17 +80,17 @@ def _image_boxes(objects: Sequence[KittiObject]) -> NDArray[np.float64]:
 
 
 def files_of_frames(folder: Path) -> dict[str, Path]:
-    """The files `FRAME.txt` of a folder, or of `data` below it, else those of a plain folder, by frame."""
+    """The files `FRAME.txt` of a folder, or of its subfolder `data`, else the files of a plain folder, by frame."""
     nested = folder / "data"
     files = visible_files(nested if nested.is_dir() else folder, [".txt"])
     return {path.stem: path for path in files or visible_files(_frames_in(folder), [".json"])}
 
 
 def objects_of_frame(source: Path, frame_id: str, are_labels: bool = False) -> list[KittiObject]:
-    """The detections or labels of a frame in KITTI's files (`kitti_labels.objects_path`) or those of a plain folder.
+    """The detections or labels of a frame from KITTI's files (`kitti_labels.objects_path`) or a plain folder's.
 
     Raises:
-        DataFormatError: there is no file of the frame, it is damaged, or it holds no labels.
+        DataFormatError: there is no file of the frame, it is damaged, or it has no labels.
     """
     in_folder = found(_frames_in(source) / f"{frame_id}.json")
     if in_folder is None:
@@ -103,17 +105,17 @@ def objects_of_frame(source: Path, frame_id: str, are_labels: bool = False) -> l
 
 
 def _frames_in(folder: Path) -> Path:
-    """The folder of a plain folder's JSON files, which may be named by itself."""
+    """The folder of a plain folder's JSON files, which may also be given directly."""
     return folder / "frames" if (folder / "frames").is_dir() else folder
 
 
 def chosen_frames(
     known: Sequence[str], frames: Iterable[str | int] | None, split: Path | str | None, expected: str
 ) -> list[str]:
-    """Those of the known frames that a caller names by id or number, or in a file with one a line; all by default.
+    """The known frames that a caller names by id or number, or in a file with one in each line; all by default.
 
     Raises:
-        InputError: unknown ones, in the words for what was expected, or none at all.
+        InputError: a frame is unknown, which the error says in the words of `expected`, or no frame is left.
         DataFormatError: the file cannot be read.
     """
     if split is not None:

@@ -1,4 +1,4 @@
-"""How far a 3D box is from the true one: centre, heading, overlap."""
+"""This module computes errors of 3D boxes: centre, heading and IoU."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ Number = TypeVar("Number", Tensor, float)
 
 
 class PoseErrors(NamedTuple, Generic[Number]):
-    """Errors of N boxes against the true ones, each (N,); or of one box, each a number."""
+    """A `PoseErrors` has the errors of N boxes against the true ones, each (N,), or of one box, each a number."""
 
     centre_m: Number  # distance of the centres of the boxes (not of their bottom faces), metres
-    centre_bev_m: Number  # the same seen from above, along x and z alone
+    centre_bev_m: Number  # distance of the centres seen from above, along x and z
     yaw_deg: Number  # difference of heading, 0 .. 180 degrees (modulo 360)
-    yaw_axis_deg: Number  # the same without regard to front and back, 0 .. 90 degrees (modulo 180)
-    bev_iou: Number  # overlap of the footprints
-    iou_3d: Number  # overlap of the boxes
-    along_m: Number  # of the centre seen from above, along the viewing ray of the true box; above 0: too far
-    across_m: Number  # across that ray; above 0: to the right
-    length_m: Number  # above 0 where a box is too long
+    yaw_axis_deg: Number  # difference of heading without regard to front and back, 0 .. 90 degrees (modulo 180)
+    bev_iou: Number  # IoU of the footprints
+    iou_3d: Number  # IoU of the boxes
+    along_m: Number  # error of the centre along the viewing ray of the true box, seen from above; positive: too far
+    across_m: Number  # error across that ray; positive: to the right
+    length_m: Number  # positive for a box that is too long
 
 
 CarErrors = PoseErrors[float]
 
 
 def errors_of(objects: Sequence[KittiObject], true: Sequence[KittiObject]) -> list[CarErrors]:
-    """The errors of each object against the true one of the same place."""
+    """The errors of each object against the true object with the same index."""
     errors = pose_errors(boxes_of(objects), boxes_of(true))
     return [PoseErrors(*row) for row in torch.stack(list(errors), dim=-1).tolist()]
 

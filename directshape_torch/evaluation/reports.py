@@ -1,4 +1,4 @@
-"""What `compare`, `evaluate` and `evaluate-shape` print and write: text tables, CSV and JSON."""
+"""This module formats the results of `compare`, `evaluate` and `evaluate-shape` as text tables, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _SHAPE_COLUMNS = ("frame_id", "detection_line", "label_line", "status", "depth_m
 
 
 def format_comparison(found: Comparison) -> str:
-    """Figures overall, and one line a group of cars."""
+    """Text with the figures of all cars and one line for each group of cars."""
     overall = found.overall
     heading = [
         f"{overall.num_detections} detections of {found.num_labels_counted} counted labels in {found.num_frames} frames"
@@ -70,7 +70,7 @@ def write_comparison_csv(path: Path | str, cars: Sequence[ComparedCar]) -> None:
 
 
 def format_scores(found: KittiScores) -> str:
-    """Average precision, and orientation similarity where it is known."""
+    """Text with average precision and, if it is known, orientation similarity."""
     of_image = {score.difficulty: score for score in reversed(found.scores) if score.metric == "2d"}
     counts = ", ".join(f"{of_image[d.name].num_labels} {d.name}" for d in DIFFICULTIES)
     heading = [f"{found.object_type}: {found.num_detections} detections in {found.num_frames} frames; labels: {counts}"]
@@ -93,7 +93,7 @@ def format_scores(found: KittiScores) -> str:
 
 
 def _ap_table(scores: Sequence[ApScore], corner: str, figures: dict[str, str]) -> str:
-    """One line for each metric and overlap, one column for each figure and difficulty."""
+    """Table with one line for each metric and IoU, and one column for each figure and difficulty."""
     rows = [[corner, "IoU >", *(f"{name} {difficulty.name}" for name in figures for difficulty in DIFFICULTIES)]]
     for metric, minimum_iou in dict.fromkeys((s.metric, s.minimum_iou) for s in scores):
         cells = {s.difficulty: s for s in scores if (s.metric, s.minimum_iou) == (metric, minimum_iou)}
@@ -103,7 +103,7 @@ def _ap_table(scores: Sequence[ApScore], corner: str, figures: dict[str, str]) -
 
 
 def format_shape_scores(found: ShapeScores) -> str:
-    """For each metric one line a distance tau."""
+    """Text with a table for each metric, one line for each distance tau."""
     cars, statuses = len(found.cars), Counter(car.status for car in found.cars)
     heading = [
         f"{cars} of {found.num_labels_counted} counted labels in {found.num_frames} frames; "
@@ -154,7 +154,7 @@ def _text(heading: Sequence[str], *tables: str) -> str:
 
 
 def write_scores(path: Path | str, scores: Comparison | KittiScores | ShapeScores) -> None:
-    """Write all figures but those of single cars as JSON (schema 1): estimates as value, low, high."""
+    """Write all figures except those of single cars as JSON (schema 1); estimates have value, low and high."""
     content = {f.name: _plain(getattr(scores, f.name)) for f in fields(scores) if f.name != "cars"}
     for score in content.get("scores", ()):
         score |= score.pop("curve")
@@ -162,7 +162,7 @@ def write_scores(path: Path | str, scores: Comparison | KittiScores | ShapeScore
 
 
 def _plain(value: Any) -> Any:
-    """Nested dataclasses, tuples and arrays as JSON has them: objects, lists, and null for what is not finite."""
+    """Nested dataclasses, tuples and arrays as JSON values: objects, lists, and null for values that are not finite."""
     if is_dataclass(value):
         return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, dict):

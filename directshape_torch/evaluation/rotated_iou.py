@@ -1,9 +1,9 @@
-"""Overlap of rotated rectangles and of KITTI's upright 3D boxes, exact and without tolerances.
+"""This module computes IoU of rotated rectangles and of KITTI's upright 3D boxes, exactly and without tolerances.
 
-The area that two convex shapes share is found without clipping polygons: the outline of the one, clamped into the
-other, still winds once about every point they share and about no other point inside, because a point and its clamped
-place never lie on different sides of an inner point. A rectangle is clamped in its own frame by `clamp`, and a clamped
-edge is a polyline with at most four breaks, so the area is one shoelace sum over 4 edges with 5 pieces each.
+The common area of two convex shapes is found without clipping polygons. The outline of one shape, clamped into the
+other, still winds once around every common point and around no other point inside, because a point and its clamped
+position are never on different sides of an inner point. A rectangle is clamped in its own frame by `clamp`, and a
+clamped edge is a polyline with at most four breaks, so the area is one shoelace sum over 4 edges with 5 pieces each.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def bev_iou(
 ) -> Tensor:
     """Intersection over union (N,) of pairs of footprints: x, z, length, width in metres, rotation_y in radians.
 
-    `rotation_y` turns about the y axis, which points down (KITTI): the corner (dx, dz) of the box lies at
-    (c dx + s dz, -s dx + c dz). A pair whose areas are both zero has overlap 0.
+    `rotation_y` is about the y axis, which points down (KITTI): the corner (dx, dz) of the box is at (c dx + s dz, -s
+    dx + c dz). A pair whose areas are both zero has IoU 0.
 
     Raises:
         InputError: a shape other than (N, 5), or two different N.
@@ -84,7 +84,7 @@ def _area(footprint: Tensor) -> Tensor:
 
 
 def _ratio(intersection: Tensor, size_a: Tensor, size_b: Tensor) -> Tensor:
-    """Intersection over union; 0 where both sets are empty."""
+    """Intersection over union, or 0 if both sets are empty."""
     intersection = torch.minimum(intersection.clamp_min(0), torch.minimum(size_a, size_b))
     union = size_a + size_b - intersection
     empty = union <= 0
@@ -95,7 +95,7 @@ def _intersection_area(
     a: Tensor,  # (*, 5)
     b: Tensor,  # (*, 5), broadcasts with a
 ) -> Tensor:
-    """Area (*,) that two footprints share: the outline of a, in the frame of b, clamped into b."""
+    """Common area (*,) of two footprints, from the outline of a clamped into b."""
     half_b = 0.5 * b[..., 2:4].clamp_min(0)
     start = _corners_in_frame(a, b)  # (*, 4, 2)
     outline = _clamped_edges(start, start.roll(-1, dims=-2), half_b)  # (*, 4 edges, 6 points, 2)
@@ -104,12 +104,12 @@ def _intersection_area(
 
 
 def _corners_in_frame(a: Tensor, b: Tensor) -> Tensor:
-    """Corners (*, 4, 2) of footprint a in the frame of footprint b: along its length, along its width."""
+    """Corners (*, 4, 2) of footprint a in the frame of footprint b: along its length and along its width."""
     offset = a[..., :2] - b[..., :2]
     cos_b, sin_b = torch.cos(b[..., 4]), torch.sin(b[..., 4])
     centre_x = cos_b * offset[..., 0] - sin_b * offset[..., 1]
     centre_y = sin_b * offset[..., 0] + cos_b * offset[..., 1]
-    # One rotation by the difference, so that boxes of equal heading stay exactly parallel.
+    # A single rotation by the difference keeps boxes of equal heading exactly parallel.
     turn = a[..., 4] - b[..., 4]
     cosine, sine = torch.cos(turn)[..., None], torch.sin(turn)[..., None]
     half = 0.5 * a[..., 2:4].clamp_min(0)
@@ -130,11 +130,11 @@ def _clamped_edges(
     direction = end - start
     parallel = direction == 0
     sides = torch.cat([-half, half], dim=-2)  # (*, 1, 2, 2)
-    # An edge parallel to a side has no break there; any parameter serves as a superfluous one.
+    # An edge parallel to a side has no break there, so any parameter may be used for it.
     breaks = (sides - start[..., None, :]) / torch.where(parallel, torch.ones_like(direction), direction)[..., None, :]
     breaks = breaks.clamp(0, 1).flatten(-2).sort(dim=-1).values  # (*, E, 4)
     zero, one = torch.zeros_like(breaks[..., :1]), torch.ones_like(breaks[..., :1])
     t = torch.cat([zero, breaks, one], dim=-1)[..., None]  # (*, E, 6, 1)
-    # Both ends are taken as they are: start + 1 * direction need not be `end` in floating point.
+    # Both ends are taken unchanged, because start + 1 * direction may differ from `end` in floating point.
     points = torch.where(t == 1, end[..., None, :], start[..., None, :] + t * direction[..., None, :])
     return torch.minimum(torch.maximum(points, -half), half)

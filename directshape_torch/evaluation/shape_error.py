@@ -1,4 +1,4 @@
-"""Completeness, accuracy, F1 and RMSE of estimated surfaces against true ones, as points that a mask's pixels show."""
+"""This module computes completeness, accuracy, F1 and RMSE of estimated surface points against true ones."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ Points = NDArray[np.float64]
 
 _SAMPLES_PER_RAY = 96
 TAUS_M = tuple(k / 20 for k in range(1, 21))
-"""Distances within which a point counts as matched, metres: 0.05, 0.1 .. 1.0."""
+"""These are the distances within which a point counts as matched, metres: 0.05, 0.1 .. 1.0."""
 
 
 @dataclass(frozen=True)
 class ShapeError:
-    """How well the true and the estimated points of one car match, at T distances tau; shares but for the last."""
+    """A `ShapeError` says how well the true and the estimated points of one car match, at T distances tau."""
 
     num_true: int
     num_estimated: int
-    completeness: NDArray[np.float64]  # (T,) of the true points, those with an estimated point within tau
-    accuracy: NDArray[np.float64]  # (T,) of the estimated points, those with a true point within tau; 0 without any
-    f1: NDArray[np.float64]  # (T,) harmonic mean of the two; 0 where both are
+    completeness: NDArray[np.float64]  # (T,) share of true points with an estimated point within tau
+    accuracy: NDArray[np.float64]  # (T,) share of estimated points with a true point within tau; 0 without any
+    f1: NDArray[np.float64]  # (T,) harmonic mean of completeness and accuracy; 0 if both are 0
     # (T,) root mean square of the distances of matched true points to their closest estimates, metres; NaN without any.
     rmse_m: NDArray[np.float64]
 
@@ -57,17 +57,18 @@ def shape_error(
     compute the distance to the closest estimate point. The RMSE is only computed for those GT points with matched
     estimated points."
 
-    It leaves open, and here it is: "within" is at most tau; distances are Euclidean, in 3D; without any match F1 is 0
-    and RMSE undefined; what the points of a surface are, and how cars are averaged, is for the caller (see
-    `evaluate_shapes`). RMSE must be read beside completeness: an estimate that matches few points may have a small one.
+    The paper leaves some points open. Here "within" means at most tau, and distances are Euclidean in 3D. Without any
+    match F1 is 0 and RMSE is undefined. The caller chooses the points of a surface and how cars are averaged (see
+    `evaluate_shapes`). RMSE must be read together with completeness, because an estimate that matches few points may
+    have a small RMSE.
 
     Args:
-        true_points: N >= 1, metres, in any frame.
-        estimated_points: in the same frame; M = 0 matches nothing.
+        true_points: true points, N >= 1, metres, in any frame.
+        estimated_points: points in the same frame; with M = 0 nothing is matched.
         taus_m: distances, metres, above 0.
 
     Raises:
-        InputError: no true points, a wrong shape, numbers that are not finite, or a tau that is not above 0.
+        InputError: there are no true points, a shape is wrong, a number is not finite, or a tau is not above 0.
 
     Examples:
         >>> error = shape_error(np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([[0.0, 0, 0.3]]), taus_m=(0.2, 0.5))
@@ -111,7 +112,7 @@ def _checked(name: str, points: Points) -> Points:
 
 @dataclass(frozen=True)
 class EstimatedCar:
-    """One car as a refinement sees it."""
+    """An `EstimatedCar` is one car with its estimated shape and pose."""
 
     prior: ShapePrior  # the family of shapes
     code: Tensor  # (K,) standard deviations
@@ -122,7 +123,7 @@ class EstimatedCar:
         uv_left: NDArray[np.float64],  # (P, 2)
         K_left: Tensor,  # (3, 3)
     ) -> Points:  # (P, 3)
-        """Where the rays of left pixels first meet the surface, left camera frame, metres; NaN where they miss it."""
+        """First intersections of rays of left pixels with the surface, left camera frame, metres; NaN for misses."""
         like, rays_cam = self.prior.origin, rays_from_pixels(torch.from_numpy(uv_left), K_left.double())
         state = CarState.of(se3.inverse(self.T_cam_obj.double())[None].to(like), self.code[None].to(like))
         depth = cast(self.prior, state, torch.zeros_like(like), rays_cam.to(like), _SAMPLES_PER_RAY).depth
@@ -131,25 +132,26 @@ class EstimatedCar:
 
 @dataclass(frozen=True)
 class SegmentTruth:
-    """The N pixels inside the segment of one car whose true depth is known."""
+    """A `SegmentTruth` has the N pixels of one car's segment whose true depth is known."""
 
-    segment: str  # which pixels these are, for reports
+    segment: str  # description of the segment, for reports
     uv_left: NDArray[np.float64]  # (N, 2) pixels of the left image
     points_cam: Points  # (N, 3) left camera frame, metres
     K_left: Tensor  # (3, 3) pixels
 
     def errors(self, car: EstimatedCar) -> ShapeError:
-        """Of an estimated car: a ray a pixel, so that a perfect shape gives the true points themselves."""
+        """Errors of an estimated car, with one ray for each pixel, so that a perfect shape gives the true points."""
         points_cam = car.points_at_pixels(self.uv_left, self.K_left)
         return shape_error(self.points_cam, points_cam[np.isfinite(points_cam).all(axis=1)])
 
 
 def folder_of_maps(training: Path) -> Path:
-    """The folder of true maps, 16 bits, 0 where unknown: `disp_occ_0` (disparity x 256), or else `depth_2` (metres x
-    256).
+    """The folder of true maps of 16 bits, with 0 for unknown.
+
+    It is `disp_occ_0` (disparity x 256), else `depth_2` (metres x 256).
 
     Raises:
-        DataFormatError: neither is there.
+        DataFormatError: neither folder exists.
     """
     for folder in (training / "disp_occ_0", training / "depth_2"):
         if folder.is_dir():
@@ -160,15 +162,15 @@ def folder_of_maps(training: Path) -> Path:
 def segments_of(
     path: Path, masks: MaskSource, labels: Sequence[KittiObject], camera: StereoCamera
 ) -> dict[int, SegmentTruth]:  # by line number of the label
-    """The segments of the labels of a frame that have a mask with known depths in it.
+    """The segments of a frame's labels that have a mask with known depths, by line number of the label.
 
     The segment of a label is the mask of the left image that is matched to it (`io.mask_matching`).
 
     Args:
         path: the frame's map, in one of the folders of `folder_of_maps`.
-        masks: of the left images.
-        labels: all with a 3D box: they compete for the masks.
-        camera: of the frame.
+        masks: masks of the left images.
+        labels: labels, all with a 3D box, which compete for the masks.
+        camera: camera of the frame.
 
     Raises:
         DataFormatError: the map or the masks are missing or damaged.
@@ -199,7 +201,7 @@ def segment_truth(
 
 
 def read_depth(path: Path) -> NDArray[np.float64]:
-    """A map of 16 bits, metres times 256, as (H, W) metres, NaN where it is 0: everywhere where nothing is known."""
+    """Depths (H, W), metres, from a 16-bit map of metres times 256; 0 (unknown) becomes NaN."""
     stored = read_single_channel(path)
     if stored.dtype != np.uint16:
         raise DataFormatError(path, f"expected 16 bits (metres times 256), got {stored.dtype}")
@@ -207,7 +209,7 @@ def read_depth(path: Path) -> NDArray[np.float64]:
 
 
 def _depth_of(disparity: NDArray[np.float32], camera: StereoCamera) -> NDArray[np.float64]:
-    """Metres; the residual disparity field of a rig plays no part: it corrects what a pair measures, not the truth."""
+    """Depths in metres without the rig's disparity field, which corrects measured disparities and not the truth."""
     height, width = disparity.shape
     uv = torch.from_numpy(np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64))
     K_left, K_right, T_right_cam = (x[0].double() for x in (camera.K_left, camera.K_right, camera.T_right_cam))

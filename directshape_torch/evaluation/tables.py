@@ -1,4 +1,4 @@
-"""Figures as text tables (aligned columns, units, intervals) and as CSV."""
+"""This module formats figures as text tables (aligned columns, units, intervals) and as CSV."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from directshape_torch.files import atomic_files
 
 
 def align(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of equally many cells as lines with aligned columns, the first ruled off as the heading.
+    """Lines of text with aligned columns from rows of equally many cells, and a ruled heading from the first row.
 
     Examples:
         >>> print(align([["metric", "value"], ["F1", "0.5"]]))
@@ -29,11 +29,11 @@ def align(rows: Sequence[Sequence[str]]) -> str:
 
 
 def number(unit: str, value: float, sign: bool = False) -> str:
-    """A figure with its unit: shares ("%") in percent, degrees ("deg") with two digits, all else with three.
+    """A figure with its unit: shares ("%") in percent, degrees ("deg") with two digits, others with three.
 
     Args:
         unit: "%", "deg", "m", or "" for none.
-        value: a share for "%"; what is not finite is a dash.
+        value: a share for "%"; a value that is not finite gives a dash.
         sign: whether a positive figure has a plus.
 
     Examples:
@@ -50,7 +50,7 @@ def number(unit: str, value: float, sign: bool = False) -> str:
 
 
 def with_interval(unit: str, estimate: Estimate, sign: bool = False) -> str:
-    """An estimate as `number` writes it, and its interval in brackets where it has one.
+    """An estimate in the format of `number`, followed by its interval in brackets if it has one.
 
     Examples:
         >>> with_interval("%", Estimate(0.5, 0.25, 0.75))
@@ -64,7 +64,7 @@ def with_interval(unit: str, estimate: Estimate, sign: bool = False) -> str:
 
 
 def write_csv(path: Path | str, rows: Iterable[Sequence[Any]]) -> None:
-    """Write rows, the first of which names the columns: six digits a number, nothing for one that is not finite."""
+    """Write rows, the first with the names of columns; numbers have six digits, and non-finite ones are empty."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([_cell(value) for value in row] for row in rows)
     atomic_files.write_text(path, text.getvalue())
