@@ -1,1 +1,1 @@
-"""Pictures of results, pixels, shape priors and disparity fields."""
+"""This package draws pictures of results, pixels, shape priors and disparity fields."""

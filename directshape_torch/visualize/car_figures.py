@@ -1,4 +1,4 @@
-"""Figures of a car (paper): sampled pixels, residuals, the course of its refinement, the drift without photometry."""
+"""This module draws figures of a car: sampled pixels, residuals, its iterations, and the drift without photometry."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from directshape_torch.visualize.refinement_trace import RefinementTrace
 from directshape_torch.visualize.residuals import WORST_GREY_LEVELS, CarResiduals, PixelResiduals, draw_residuals
 
 _PANEL_PX, _LARGE_PX = (400, 300), (720, 540)
-# Of sampled pixels: the words for how they were chosen, and their ink.
+# These are the words and the colour for each way to choose sampled pixels.
 _CHOSEN: dict[SamplingMode, tuple[str, Colour]] = {
     "adaptive": ("strongest gradient of its cell", (0, 255, 0)),
     "uniform": ("evenly spaced", (255, 255, 0)),
@@ -63,12 +63,12 @@ _MEANING = (
 
 @dataclass(frozen=True)
 class CarCourse:
-    """One car of a frame and the states that it went through."""
+    """A `CarCourse` is one car of a frame with the states of its refinement."""
 
     loaded: LoadedFrame
     trace: RefinementTrace  # of a refinement of the frame's detections
-    row: int  # of the detections; it took part in the refinement
-    truth_corners_cam: Array | None = None  # (8, 3) of its labelled box, in the order of `box_corners`
+    row: int  # row of the detections; the car took part in the refinement
+    truth_corners_cam: Array | None = None  # (8, 3) of the labelled box, in the order of `box_corners`
 
     def __post_init__(self) -> None:
         if self.trace.place_of(self.row) < 0:
@@ -77,12 +77,12 @@ class CarCourse:
 
     @property
     def title(self) -> str:
-        """Frame, car and how it ended."""
+        """Frame, car and status, as text."""
         return f"frame {self.loaded.frame_id}, car {self.cars[0].line}: {self.trace.result.status[self.row].name}"
 
     @cached_property
     def steps(self) -> list[int]:
-        """Numbers of the states to show: the input, every one to which the car moved, the last."""
+        """Numbers of the states to show: the input, every state to which the car moved, and the last one."""
         return self.trace.steps_of(self.row)
 
     @cached_property
@@ -93,19 +93,19 @@ class CarCourse:
 
     @property
     def costs(self) -> dict[str, NDArray[np.float64]]:
-        """Cost (N + 1,) of each term by its name, at the final stage's settings, and their "sum"."""
+        """Cost (N + 1,) of each term by its name, with the settings of the final stage, and their "sum"."""
         costs = self.trace.costs[:, self.row].cpu().numpy()
         return {**dict(zip(self.trace.result.term_names, costs.T, strict=True)), "sum": costs.sum(axis=1)}
 
     @property
     def distances(self) -> Array:
-        """Distance (N + 1,) from the true centre on the ground, or without truth from the input's, metres."""
+        """Distance (N + 1,) on the ground from the true centre, or without truth from the input's centre, metres."""
         true = self.cars[0].corners_cam if self.truth_corners_cam is None else self.truth_corners_cam
         away = [np.linalg.norm((car.corners_cam - true).mean(axis=0)[[0, 2]]) for car in self.cars]
         return np.array([away[bisect(self.steps, number) - 1] for number in range(len(self.trace))])
 
     def view(self, side: Side, size_wh: tuple[int, int] = _PANEL_PX) -> View:
-        """The part of an image around the car; the rig's field is that of the car's input place."""
+        """The part of an image around the car; the disparity field is evaluated at the input pose of the car."""
         frame, image = self.loaded.frame, View.of_frame(self.loaded.frame, side)
         if side == "right":
             centre = self.cars[0].corners_cam.mean(axis=0, keepdims=True)
@@ -118,7 +118,7 @@ class CarCourse:
         return image.around(shown, size_wh) or image.part((0, 0, width, height), size_wh)
 
     def outlined(self, side: Side, cars: Sequence[tuple[DrawnCar, Colour]] = ()) -> Picture:
-        """The car in an image, its mask white, and its contours in some states."""
+        """The car in an image, with its mask in white and its contours in some states."""
         view = self.view(side)
         self.draw_mask(view, side)
         for car, ink in cars:
@@ -127,7 +127,7 @@ class CarCourse:
         return view.picture
 
     def draw_mask(self, view: View, side: Side) -> None:
-        """The outline of the instance mask, where there is one."""
+        """Draw the outline of the instance mask, if there is one."""
         d = self.loaded.detections
         masks, present = (d.mask_left, d.has_mask_left) if side == "left" else (d.mask_right, d.has_mask_right)
         if bool(present[self.row]):
@@ -137,7 +137,7 @@ class CarCourse:
             draw_outline(view.picture, (found > MASK_THRESHOLD).astype(np.uint8), WHITE, 1)
 
     def from_above(self, count: int) -> Picture:
-        """The first `count` boxes and the true one; all boxes would fit, so that pictures can follow one another."""
+        """The first `count` boxes and the true one from above, with room for all boxes, as an animation needs."""
         truth = [] if self.truth_corners_cam is None else [self.truth_corners_cam]
         points_cam = np.concatenate([*truth, *(car.corners_cam for car in self.cars)])
         ground = ground_view(points_cam, _PANEL_PX[1:] * 2, margin_m=0.7, least_depth_m=1.0)
@@ -149,7 +149,7 @@ class CarCourse:
 
 
 def sampled_pixels_of(car: CarCourse, side: Side) -> tuple[NDArray[np.int64], int]:
-    """The pixels (P, 2) that the refinement used, and how many more a nearer instance hides."""
+    """The pixels (P, 2) that the refinement used, and the number of further pixels that nearer instances hide."""
     trace, config = car.trace, replace(car.trace.config.sampling, occlusion=False)
     unhidden = pack_pixels(car.loaded.frame, car.loaded.detections, config)
     (used, place), (found, row) = (
@@ -177,7 +177,7 @@ def sampling_figure(car: CarCourse) -> Picture:
 
 
 def residual_figure(car: CarCourse) -> Picture:
-    """The residuals of input and end in three columns, with the contour."""
+    """The residuals of input and result in three columns, with the contour."""
     rows = []
     for name, number, drawn, ink in (("before", 0, 0, ORANGE), ("after", len(car.trace) - 1, -1, BLUE)):
         residuals = car.trace.residuals(number)[car.row]
@@ -212,11 +212,11 @@ def iteration_frames(car: CarCourse) -> list[Picture]:
 
 
 def drift_figure(full: CarCourse, silhouettes: CarCourse) -> Picture:
-    """A car refined with all terms beside the same refined without photometry."""
+    """A car refined with all terms, compared with its refinement without photometry."""
     rows = []
     for name, car in (("silhouettes alone", silhouettes), ("all terms", full)):
         inks, last = _step_inks(len(car.cars)), len(car.cars) - 1
-        # The first, an early and the last state: most is done in the first few steps.
+        # The first, an early and the last state are shown, because the car moves most in the first few steps.
         places = (0, min(max(last // 4, 1), last), last)
         images = [
             titled(car.outlined("left", [(car.cars[place], inks[place])]), f"{name}: iteration {car.steps[place]}")
@@ -236,6 +236,6 @@ def _legend(car: CarCourse) -> dict[str, Colour]:
 
 
 def _step_inks(count: int) -> list[Colour]:
-    """From that of the input by way of rose to that of the result."""
+    """Colours of the steps, from the input's by way of rose to the result's."""
     ends, at = np.array([ORANGE, _ROSE, BLUE]), np.linspace(0, 2, max(count, 2))
     return [(int(r), int(g), int(b)) for r, g, b in zip(*(np.interp(at, (0, 1, 2), c) for c in ends.T), strict=True)]

@@ -1,4 +1,4 @@
-"""Lines, text, charts and projected things on pictures (h, w, 3), RGB uint8, and pictures put together."""
+"""This module draws lines, text, charts and projected objects on pictures (h, w, 3), RGB uint8, and joins pictures."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ Picture = npt.NDArray[np.uint8]
 Array = npt.NDArray[np.floating[Any]]
 Colour = tuple[int, int, int]
 Window = tuple[int, int, int, int]
-"""A part of an image, half open: u_min, v_min, u_max, v_max."""
+"""This is a part of an image, u_min, v_min, u_max, v_max, where the maxima are excluded."""
 
-# The same everywhere: before, after, truth, not refined; masks are white.
+# All pictures use these colours: before, after, truth, not refined. Masks are white.
 ORANGE, BLUE, GREEN, GREY = (255, 140, 0), (30, 144, 255), (60, 220, 80), (170, 170, 170)
 WHITE, BLACK = (255, 255, 255), (0, 0, 0)
 GROUND: Colour = (28, 30, 34)
@@ -39,18 +39,18 @@ _SHIFT = 4
 # Beyond this OpenCV's fixed-point coordinates would overflow.
 _FARTHEST_PX = 1e5
 _GAP_PX = 6
-# Around a car, as a share of its size; of a far one at least so much is shown.
+# The part around a car is larger than the car by this factor, and at least this high for a far car.
 _ROOM, _LEAST_TALL_PX = 1.25, 12.0
 _LINE_PX = 26
 
 
 @dataclass(frozen=True)
 class View:
-    """A picture with the projection into its pixels: an image, an enlarged part of one, the ground, a chart."""
+    """A `View` is a picture with the projection into its pixels: an image or a part of it, the ground, or a chart."""
 
     picture: Picture  # (h, w, 3), drawn in place
     P: Array  # (3, 4) from the left camera's frame to homogeneous pixels of the picture
-    from_image: Array = field(default_factory=lambda: np.eye(3))  # (3, 3) from the whole image's pixels to these
+    from_image: Array = field(default_factory=lambda: np.eye(3))  # (3, 3) from the whole image's pixels to these pixels
 
     @classmethod
     def of_frame(cls, frames: FrameBatch, side: Side = "left", number: int = 0) -> View:
@@ -69,11 +69,11 @@ class View:
         return self.P[:, :3]
 
     def copy(self) -> View:
-        """To draw on, where this one shall stay as it is."""
+        """A view with a copy of the picture, so that drawings leave the original unchanged."""
         return replace(self, picture=self.picture.copy())
 
     def part(self, window: Window, size_wh: tuple[int, int]) -> View:
-        """A window, brought to a size; beyond the picture it is black."""
+        """A window, resized; it is black outside the picture."""
         u0, v0, u1, v1 = window
         part = np.zeros((v1 - v0, u1 - u0, 3), np.uint8)
         height, width = self.picture.shape[:2]
@@ -82,12 +82,12 @@ class View:
             part[b - v0 : d - v0, a - u0 : c - u0] = self.picture[b:d, a:c]
         s_u, s_v = size_wh[0] / (u1 - u0), size_wh[1] / (v1 - v0)
         picture = cv2.resize(part, size_wh, interpolation=cv2.INTER_CUBIC if s_u > 1 else cv2.INTER_AREA)
-        # Pixel centres are whole numbers: the edge of a picture lies at -0.5.
+        # Pixel centres are whole numbers, so the edge of a picture is at -0.5.
         to_part = np.array([[s_u, 0, s_u * (0.5 - u0) - 0.5], [0, s_v, s_v * (0.5 - v0) - 0.5], [0, 0, 1]])
         return View(np.ascontiguousarray(picture, dtype=np.uint8), to_part @ self.P, to_part @ self.from_image)
 
     def around(self, points_cam: Array, size_wh: tuple[int, int]) -> View | None:
-        """The part that shows points (N, 3) with some room, of that size; None where they are not seen."""
+        """The part of the given size that shows points (N, 3) with some room, or None if they are not visible."""
         bounds = self.bounds(points_cam)
         if bounds is None:
             return None
@@ -95,23 +95,23 @@ class View:
         tall = max(_ROOM * (v1 - v0), _ROOM * (u1 - u0) / aspect, _LEAST_TALL_PX)
         height, width = self.picture.shape[:2]
         left, top = (u0 + u1 - aspect * tall) / 2, (v0 + v1 - tall) / 2
-        # As far as it fits within the picture.
+        # The part stays within the picture if it fits.
         left, top = min(max(left, 0), max(width - aspect * tall, 0)), min(max(top, 0), max(height - tall, 0))
         window = round(left), round(top), round(left + aspect * tall), round(top + tall)
         return self.part(window, size_wh)
 
     def project(self, points_cam: Array) -> Array:
-        """Pixels (N, 2) of points (N, 3); meaningless behind the camera."""
+        """Pixels (N, 2) of points (N, 3); they mean nothing behind the camera."""
         pixels = points_cam @ self.P[:, :3].T + self.P[:, 3]
         depth = np.where(pixels[:, 2:] > 0, pixels[:, 2:], 1.0)
         return np.asarray(np.clip(pixels[:, :2] / depth, -_FARTHEST_PX, _FARTHEST_PX))
 
     def places(self, uv: Array) -> Array:
-        """Pixels (N, 2) of the picture where those of the whole image lie."""
+        """Pixels (N, 2) of the picture for pixels of the whole image."""
         return np.asarray(uv @ self.from_image[:2, :2].T + self.from_image[:2, 2])
 
     def bounds(self, points_cam: Array) -> tuple[float, float, float, float] | None:
-        """u_min, v_min, u_max, v_max around points as far as they are seen, or None where they are not."""
+        """u_min, v_min, u_max, v_max around the visible part of points, or None if nothing is visible."""
         in_front = points_cam[points_cam[:, 2] > NEAR_PLANE_M]
         if not len(in_front):
             return None
@@ -122,32 +122,32 @@ class View:
 
 
 def blue_white_red(values: Array, limit: float) -> Array:
-    """Colours (*, 3), 0 .. 255: blue from -limit on, white at 0 and for NaN, red from the limit on."""
+    """Colours (*, 3), 0 .. 255: blue from -limit down, white at 0 and for NaN, red from the limit up."""
     share = np.clip(np.nan_to_num(values) / limit, -1, 1)[..., None]
     white, red, blue = (np.array(c, dtype=np.float64) for c in ((245, 245, 245), (214, 47, 39), (49, 87, 200)))
     return np.asarray(white + np.abs(share) * (np.where(share > 0, red, blue) - white))
 
 
 def draw_contour(view: View, surface: trimesh.Trimesh, colour: Colour, thickness: int = 2) -> None:
-    """The outline of the projected shape (what its silhouette term sees)."""
+    """Draw the outline of the projected shape, as its silhouette term sees it."""
     draw_outline(view.picture, silhouette_mask(view, surface), colour, thickness)
 
 
 def draw_outline(picture: Picture, mask: Picture, colour: Colour, thickness: int = 2) -> None:
-    """The outlines of a mask (h, w) that is not 0; the picture's border is no part of them."""
+    """Draw the outlines of the nonzero part of a mask (h, w), without the picture's border."""
     rim = 2 + thickness
     contours, _ = cv2.findContours(np.pad(mask, rim, mode="edge"), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(picture, contours, -1, colour, thickness, cv2.LINE_AA, offset=(-rim, -rim))
 
 
 def silhouette_mask(view: View, surface: trimesh.Trimesh) -> Picture:
-    """Where a triangle of the shape is seen, 255, else 0, (h, w); triangles that reach behind the camera are not."""
+    """Mask (h, w), 255 for pixels of the shape's triangles, else 0; triangles partly behind the camera are left out."""
     mask = np.zeros(view.picture.shape[:2], np.uint8)
     vertices, faces = np.asarray(surface.vertices), np.asarray(surface.faces)
     in_front = vertices[:, 2] > NEAR_PLANE_M
     pixels = np.zeros((len(vertices), 2), np.int32)
     pixels[in_front] = _fixed_point(view.project(vertices[in_front]))
-    # One by one: a common fill would leave what two triangles cover empty.
+    # Triangles are filled one by one, because a joint fill would leave doubly covered pixels empty.
     for triangle in pixels[faces[in_front[faces].all(axis=1)]]:
         cv2.fillConvexPoly(mask, triangle, 255, cv2.LINE_8, _SHIFT)
     return mask
@@ -158,14 +158,14 @@ def draw_box(
     corners_cam: Array,  # (8, 3) in the order of `box_corners`
     colour: Colour,
 ) -> None:
-    """The 12 edges of a 3D box, and a line on the ground from its centre to its front."""
+    """Draw the 12 edges of a 3D box, and a line on the ground from its centre to its front."""
     for first, second in BOX_EDGES:
         draw_segment(view, corners_cam[first], corners_cam[second], colour)
     draw_segment(view, corners_cam[:4].mean(axis=0), corners_cam[:2].mean(axis=0), colour)
 
 
 def draw_segment(view: View, first_cam: Array, second_cam: Array, colour: Colour) -> None:
-    """A straight line in space, cut at the near plane."""
+    """Draw a straight line in space, cut at the near plane."""
     ends = np.stack([first_cam, second_cam])
     behind = ends[:, 2] < NEAR_PLANE_M
     if behind.all():
@@ -177,7 +177,7 @@ def draw_segment(view: View, first_cam: Array, second_cam: Array, colour: Colour
 
 
 def draw_line(view: View, points: Array, colour: Colour, thickness: int = 1, *, closed: bool = False) -> None:
-    """A line through projected points (N, 3)."""
+    """Draw a line through projected points (N, 3)."""
     pixels = _fixed_point(view.project(points))
     cv2.polylines(view.picture, [pixels], closed, colour, thickness, cv2.LINE_AA, _SHIFT)
 
@@ -190,12 +190,12 @@ def draw_text(
     size: float = 0.45,
     widest_px: float = math.inf,
 ) -> None:
-    """Text with a dark rim, legible on any ground, from its lower left corner on; smaller where it is too wide."""
+    """Draw text with a dark rim from its lower left corner on, smaller if it is too wide."""
     u, v = round(position[0]), round(position[1])
-    # Names of files may hold what is no text, which would end the process.
+    # Names of files may contain bytes that are not text, which would crash OpenCV.
     drawable = text.encode("utf-8", "replace").decode()
     size *= min(1.0, widest_px / max(cv2.getTextSize(drawable, cv2.FONT_HERSHEY_SIMPLEX, size, 1)[0][0], 1))
-    # The rim is the same text moved about: in OpenCV 5 bolder letters are also wider.
+    # The rim is the same text with offsets, because bolder letters of OpenCV 5 are also wider.
     rim = [(du, dv, BLACK) for du in (-1, 0, 1) for dv in (-1, 0, 1) if du or dv]
     for du, dv, ink in (*rim, (0, 0, colour)):
         cv2.putText(picture, drawable, (u + du, v + dv), cv2.FONT_HERSHEY_SIMPLEX, size, ink, 1, cv2.LINE_AA)
@@ -204,7 +204,7 @@ def draw_text(
 def draw_legend(
     picture: Picture, entries: Mapping[str, Colour], position: tuple[int, int], across: bool = False
 ) -> None:
-    """Coloured strokes with their meaning, one a line or side by side, from the upper left corner on."""
+    """Draw coloured strokes with their meaning, in lines or side by side, from the upper left corner on."""
     (u, v), widths = position, [cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.7, 1)[0][0] + 48 for text in entries]
     wide, lines = (sum(widths), 1) if across else (max(widths), len(entries))
     picture[v : v + _LINE_PX * lines + 4, u : u + wide] //= 3
@@ -215,7 +215,7 @@ def draw_legend(
 
 
 def curves(series: Mapping[str, tuple[Array, Colour]], title: str, size_wh: tuple[int, int], now: int = -1) -> Picture:
-    """Lines over the numbers 0, 1, .. of iterations from a value of 0 on, each named in its colour; a mark at `now`."""
+    """A chart of values over iterations 0, 1, .., with values from 0 on, coloured names and a mark at `now`."""
     (width, height), left, top, low = size_wh, 70, 44, 56
     most = max(1e-9, *(float(values.max()) for values, _ in series.values()))
     last = max(1, *(len(values) - 1 for values, _ in series.values()))
@@ -239,7 +239,7 @@ def curves(series: Mapping[str, tuple[Array, Colour]], title: str, size_wh: tupl
 
 
 def titled(picture: Picture, *lines: str, size: float = 0.7, legend: Mapping[str, Colour] | None = None) -> Picture:
-    """The picture below lines of text, and one with a legend."""
+    """The picture below lines of text and, if given, a legend."""
     if legend:
         strip = np.full((_LINE_PX + 4, picture.shape[1], 3), GROUND, np.uint8)
         draw_legend(strip, legend, (0, 0), across=True)
@@ -269,7 +269,7 @@ def write_gif(path: Path | str, frames: Sequence[Picture], seconds: float, secon
     animation = cv2.Animation()
     animation.frames = [np.ascontiguousarray(frame[..., ::-1]) for frame in frames]
     animation.durations = [round(1000 * s) for s in (*[seconds] * (len(frames) - 1), seconds_at_end)]
-    # A palette of 256 colours for each picture; dithered colours would flicker.
+    # Each picture has a palette of 256 colours; dithering would flicker.
     params = [cv2.IMWRITE_GIF_QUALITY, cv2.IMWRITE_GIF_COLORTABLE_SIZE_256, cv2.IMWRITE_GIF_DITHER, 3]
     encoded, content = cv2.imencodeanimation(".gif", animation, params)
     if not encoded:

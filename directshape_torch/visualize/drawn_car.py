@@ -1,4 +1,4 @@
-"""Cars as they are drawn, before and after a refinement: the one form for pictures, pages and animations."""
+"""This module has the drawn form of cars before and after a refinement, for pictures, pages and animations."""
 
 from __future__ import annotations
 
@@ -26,44 +26,44 @@ if TYPE_CHECKING:
     import trimesh
 
 
-# More cars make a picture unreadable; farther is none.
+# More cars make a picture unreadable. No car is farther away than this distance.
 _MOST_CARS, _FARTHEST_M = 60, 1e6
 
 
 @dataclass(frozen=True)
 class DrawnCar:
-    """A car in one state, in the left camera frame."""
+    """A `DrawnCar` is a car in one state, in the left camera frame."""
 
     T_cam_obj: Array  # (4, 4) of the shape
-    corners_cam: Array  # (8, 3) of its box, in the order of `box_corners`, metres
+    corners_cam: Array  # (8, 3) of the box, in the order of `box_corners`, metres
     code: Array  # (K,) of the shape
-    mesh: trimesh.Trimesh | None  # the shape in its object frame, or None where no prior is at hand
+    mesh: trimesh.Trimesh | None  # the shape in its object frame, or None without a prior
     line: int  # of the detection file, or row of the call
-    status: str | None = None  # how its refinement ended; None before it
+    status: str | None = None  # status of the refinement; None before it
 
     @property
     def surface(self) -> trimesh.Trimesh | None:
-        """The shape where it is."""
+        """The shape in the left camera frame."""
         return None if self.mesh is None else self.mesh.copy().apply_transform(self.T_cam_obj)
 
     @property
     def distance_m(self) -> float:
-        """Depth of the middle of its box."""
+        """Depth of the centre of the box, metres."""
         return float(self.corners_cam[:, 2].mean())
 
     @property
     def colour(self) -> Colour:
-        """Before a refinement, after it, or of a car that was not refined."""
+        """Orange before a refinement, blue after it, grey for a car that was not refined."""
         return ORANGE if self.status is None else BLUE if self.is_refined else GREY
 
     @property
     def is_refined(self) -> bool:
-        """Whether it is in a refined state."""
+        """Whether the car is in a refined state."""
         return self.status is not None and is_refined(self.status)
 
 
 def is_refined(status: str) -> bool:
-    """Whether a status is one of a refined state; one of a later version is taken for none."""
+    """Whether a status is one of a refined state; unknown statuses of later versions count as not refined."""
     return status in Status.__members__ and Status[status].is_refined
 
 
@@ -80,7 +80,7 @@ def drawn_cars(
 
 
 def most_telling(result: RefinementResult, cars: Tensor) -> Tensor:
-    """Some cars, rows (M,), in their order; of more than 60 the refined ones first, then the nearest."""
+    """At most 60 cars, rows (M,), in their order: the refined ones first, then the nearest."""
     depth, refined = (x.detach().cpu()[cars] for x in (result.T_cam_obj[:, 2, 3], result.refined))
     order = torch.argsort(depth.abs().nan_to_num(nan=_FARTHEST_M) + torch.where(refined, 0.0, _FARTHEST_M), stable=True)
     return cars[order[:_MOST_CARS].sort().values]
@@ -103,7 +103,7 @@ def cars_of_tensors(
 def cars_of_result(
     result: RefinementResult, lines: Sequence[int], before: Sequence[DrawnCar] | None = None
 ) -> list[DrawnCar]:
-    """The cars of a result, with the numbers of their lines; those that were not refined as they were `before`."""
+    """The cars of a result, with their line numbers; cars that were not refined stay as in `before`."""
     boxes = result.boxes()
     corners = corners_cam(boxes.location_ref, boxes.rotation_y, boxes.dimensions_hwl, result.t_cam_ref)
     T_cam_obj, codes = (x.detach().cpu().numpy() for x in (result.T_cam_obj, result.code))
@@ -125,7 +125,7 @@ def cars_before(
     mean: trimesh.Trimesh | None,
     num_codes: int,
 ) -> list[DrawnCar]:
-    """The mean shape at the place of each detection, with the detection's box."""
+    """The mean shape at the pose of each detection, with the detection's box."""
     T_cam_obj = poses_cam(objects, t_cam_ref.double().cpu()).numpy()
     corners, code = box_corners_cam(objects, t_cam_ref.cpu()).numpy(), np.zeros(num_codes)
     return [
@@ -138,15 +138,15 @@ def cars_after(
     statuses: Sequence[str],
     T_cam_obj: Array,  # (B, 4, 4)
     codes: Array,  # (B, K)
-    corners: Array,  # (B, 8, 3) of their boxes, left camera frame
+    corners: Array,  # (B, 8, 3) of the boxes, left camera frame
     before: Sequence[DrawnCar] | None,
     prior: ShapePrior | None,
     mesh_files: Sequence[Path | None] | None = None,
 ) -> list[DrawnCar]:
-    """The refined shapes, of the prior or else of saved meshes, with the boxes of the result.
+    """The refined shapes, from the prior or else from saved meshes, with the boxes of the result.
 
-    Cars that were not refined stay as they were `before`, where that is known. Raises `DataFormatError` for a file
-    that is no readable mesh.
+    Cars that were not refined stay as in `before`, if it is given. A file that is not a readable mesh raises
+    `DataFormatError`.
     """
     cars = []
     for car, status in enumerate(statuses):
@@ -174,7 +174,7 @@ def decoded_car(prior: ShapePrior, code: Array) -> trimesh.Trimesh:
 
 
 def _saved_car(path: Path, T_cam_obj: Array) -> trimesh.Trimesh:
-    """The shape of a mesh file of a run, taken back from the camera to the object frame."""
+    """The shape of a saved mesh of a run, transformed from the camera to the object frame."""
     import trimesh
 
     vertices_cam, faces = read_mesh(path, cure="refine the frame again")

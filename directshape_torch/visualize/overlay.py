@@ -1,4 +1,4 @@
-"""A frame before and after its refinement: contours and boxes in the image, enlarged cars, and the view from above."""
+"""This module draws a frame before and after its refinement: image, enlarged cars, and the view from above."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from directshape_torch.visualize.drawn_car import DrawnCar, cars_of_tensors, dra
 
 _LEAST_WIDTH_PX = 1000
 _BIRDS_EYE_WIDTH_PX = 560
-# A thick contour would hide smaller cars.
+# A thick contour would hide a car that is smaller than this.
 _TALL_PX = 60
 _TILES_A_ROW = (4, 7)
 _CAMERA = np.array([[0.0, 0.0, 0.0], [-0.6, 0.0, 1.2], [0.6, 0.0, 1.2]])
@@ -46,22 +46,22 @@ _CAMERA = np.array([[0.0, 0.0, 0.0], [-0.6, 0.0, 1.2], [0.6, 0.0, 1.2]])
 def overlay(frames: FrameBatch, detections: Detections, result: RefinementResult, frame: int = 0) -> Picture:
     """The picture of one frame of a call before and after its refinement, from the tensors of the call.
 
-    It shows what `refine --overlays` draws of files: contours and boxes in the left image, each car enlarged, and all
-    cars from above. Cars have the numbers of their rows in the call, as in `print(result)`; those that were not refined
-    are grey, and one whose detected box is not finite is left out. Of more than 60 cars the refined ones come first,
-    then the nearest.
+    It shows the same as `refine --overlays`: contours and boxes in the left image, each car enlarged, and all cars from
+    above. Cars have the numbers of their rows in the call, as in `print(result)`. Cars that were not refined are grey,
+    and a car whose detected box is not finite is left out. At most 60 cars are shown, the refined ones first, then the
+    nearest.
 
     Args:
-        frames: what the refiner was given, F frames.
-        detections: what the refiner was given, N cars.
-        result: what the refiner gave back, N cars.
-        frame: which of the F frames.
+        frames: frames of the call, F frames.
+        detections: detections of the call, N cars.
+        result: result of the call, N cars.
+        frame: index of the frame.
 
     Returns:
         (h, w, 3) RGB, uint8, at least 1000 pixels wide for the image and 560 for the view from above.
 
     Raises:
-        InputError: other types, another number of cars in `result` than in `detections`, or no such frame.
+        InputError: wrong types, another number of cars in `result` than in `detections`, or no such frame.
 
     Examples:
         >>> import torch
@@ -104,7 +104,7 @@ def overlay_picture(
     truth_corners_cam: Sequence[Array] = (),
     title: str = "",
 ) -> Picture:
-    """Two rows with the image, before and after; below them each car enlarged; beside them the view from above."""
+    """Two rows with the image, before and after; below them each car enlarged; at the right the view from above."""
     rows = [
         _image_row(view, before, f"{title}  before: the detector's box, mean shape"),
         _image_row(view, after, f"{title}  after: refined box and shape"),
@@ -131,7 +131,7 @@ def _image_row(image: View, cars: Sequence[DrawnCar], title: str) -> Picture:
     height, width = image.picture.shape[:2]
     scale = max(1.0, _LEAST_WIDTH_PX / width)
     view = image.part((0, 0, width, height), (round(scale * width), round(scale * height)))
-    # Far cars first, so that near ones are drawn over them.
+    # Far cars come first, so that near cars are drawn over them.
     for car in sorted(cars, key=lambda one: -one.distance_m):
         draw_box(view, car.corners_cam, car.colour)
         height_px = float(view.K[1, 1]) * float(np.ptp(car.corners_cam[:, 1])) / max(car.distance_m, 1.0)
@@ -146,7 +146,7 @@ def _image_row(image: View, cars: Sequence[DrawnCar], title: str) -> Picture:
 
 
 def _tile_rows(image: View, before: Sequence[DrawnCar], after: Sequence[DrawnCar], width_px: int) -> list[Picture]:
-    """All cars that are seen in the image, before above after, in rows of that width."""
+    """All visible cars, before above after, in rows of the given width."""
     columns = min(max(len(after), _TILES_A_ROW[0]), _TILES_A_ROW[1])
     wide = width_px // columns - 6
     found = (_tile(image, *pair, (wide, wide * 2 // 3)) for pair in zip(before, after, strict=True))
@@ -155,7 +155,7 @@ def _tile_rows(image: View, before: Sequence[DrawnCar], after: Sequence[DrawnCar
 
 
 def _tile(image: View, before: DrawnCar, after: DrawnCar, size_wh: tuple[int, int]) -> Picture | None:
-    """None for a car that the image does not show."""
+    """A car enlarged, before above after, or None if the image does not show it."""
     states = [car for car in (before, after) if car.surface is not None]
     views = [image.around(np.concatenate([car.corners_cam for car in states]), size_wh) for _ in states]
     pictures = []
@@ -174,9 +174,9 @@ def ground_view(
     margin_m: float = 3.0,
     least_depth_m: float = 15.0,
 ) -> View:
-    """The ground from above on a grid of metres, x to the right and z upwards, as large as fits.
+    """An empty view of the ground from above on a grid of metres, x to the right and z upwards, as large as fits.
 
-    The points are in its middle; what is drawn later may lie outside.
+    The points are in its middle; later drawings may be outside.
     """
     xz = points_cam[:, [0, 2]]
     low, high = xz.min(axis=0) - margin_m, xz.max(axis=0) + margin_m
@@ -195,7 +195,7 @@ def ground_view(
         draw_line(ground, np.array([[x, 0, bottom], [x, 0, top]]), GRID)
     for z in _multiples(step, bottom, top):
         draw_line(ground, np.array([[left, 0, z], [right, 0, z]]), GRID)
-        # On the right: a legend stands on the left.
+        # The text is on the right, because a legend is on the left.
         v = ground.project(np.array([[0.0, 0.0, z]]))[0, 1]
         draw_text(ground.picture, f"{z} m", (width - 62, v - 4), GREY, 0.6)
     return ground
@@ -207,12 +207,12 @@ def _multiples(step: int, low: float, high: float) -> range:
 
 def draw_footprint(
     ground: View,
-    corners_cam: Array,  # (8, 3) of a box in the order of `box_corners`: the first two are at the front
+    corners_cam: Array,  # (8, 3) of a box in the order of `box_corners`, with the first two at the front
     colour: Colour,
     thickness: int = 1,
     label: str = "",
 ) -> None:
-    """A box from above; an open line to the front shows which way the car points."""
+    """Draw a box from above, with a line from its centre to the front that shows the heading."""
     corners = corners_cam[:4]
     draw_line(ground, corners, colour, thickness, closed=True)
     draw_line(ground, np.stack([corners.mean(axis=0), corners[:2].mean(axis=0)]), colour, thickness)

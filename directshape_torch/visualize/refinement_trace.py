@@ -1,4 +1,4 @@
-"""The course of a refinement, iteration by iteration, for pictures and viewers."""
+"""This module records a refinement, iteration by iteration, for pictures and viewers."""
 
 from __future__ import annotations
 
@@ -26,28 +26,28 @@ from directshape_torch.visualize.residuals import CarResiduals, car_residuals
 
 @dataclass(frozen=True)
 class RefinementTrace:
-    """All states that the cars of a call went through, N + 1 of B cars; the input is the first."""
+    """A `RefinementTrace` has all states of B cars of a call, N + 1 of them; the input is the first."""
 
-    # Of the refiner. Where it gives a car its input back, the trace still shows what was tried.
+    # The result of the refiner. If it gives a car its input back, the trace still has the states that were tried.
     result: RefinementResult
-    # (N + 1) states of all B cars. A car that is done, or never took part, keeps its state.
+    # (N + 1) states of all B cars. A car that has ended or never took part keeps its state.
     states: tuple[CarState, ...]
     # (N + 1) number of the stage that led to each state; -1 for the input.
     stage: tuple[int, ...]
-    accepted: Tensor  # (N + 1, B) bool: the step to this state was taken
-    # (N + 1, B, T) of each term, all at the pixel sets and sharpness of the final stage, so that they can be compared;
-    # NaN for cars that did not take part.
+    accepted: Tensor  # (N + 1, B) whether the step to this state was taken
+    # (N + 1, B, T) costs of each term, all with the pixel sets and sharpness of the final stage, so that they can be
+    # compared; NaN for cars that did not take part.
     costs: Tensor
-    rows: Tensor  # (R,) numbers of the cars that took part among the B cars, ascending
-    last_stage: CarStage  # of these R cars, whose settings the costs have
-    pixels: Observation  # of these R cars
+    rows: Tensor  # (R,) numbers of the cars that took part, out of the B cars, ascending
+    last_stage: CarStage  # final stage of the R cars, with the settings of the costs
+    pixels: Observation  # of the R cars
 
     def __len__(self) -> int:
         return len(self.states)
 
     @property
     def config(self) -> RefinerConfig:
-        """Of the refiner."""
+        """The settings of the refiner."""
         return self.last_stage.problem.config
 
     @property
@@ -61,7 +61,7 @@ class RefinementTrace:
         return torch.stack([state.code for state in self.states])
 
     def moment(self, number: int) -> RefinementResult:
-        """The result if all cars had ended in state `number`, also of cars that got their input back."""
+        """The result if all cars had ended in state `number`, also for cars that got their input back."""
         took_part = torch.zeros_like(self.result.status_code).index_fill(0, self.rows, 1).bool()
         status = self.result.status_code.where(~took_part, Status.converged.code)
         state = self.states[number]
@@ -69,29 +69,30 @@ class RefinementTrace:
 
     @torch.no_grad()
     def residuals(self, number: int) -> dict[int, CarResiduals]:
-        """What the images say of state `number` of each car that took part, by its row among the detections."""
+        """Residuals of state `number` of each car that took part, by its row among the detections."""
         sight = self.last_stage.problem.look(take_rows(self.states[number], self.rows))
         return dict(zip(self.rows.tolist(), car_residuals(self.last_stage, self.pixels, sight), strict=True))
 
     def place_of(self, car: int) -> int:
-        """Number of a car among those that took part; -1 if it did not."""
+        """Number of a car among the cars that took part; -1 if it did not."""
         places = (self.rows == car).nonzero()[:, 0].tolist()
         return places[0] if places else -1
 
     def steps_of(self, car: int) -> list[int]:
-        """Numbers of the states where this car moved, the first and the last state included."""
+        """Numbers of the states where this car moved, with the first and the last state."""
         moved = [k for k in range(1, len(self)) if bool(self.accepted[k, car])]
         return sorted({0, *moved, len(self) - 1})
 
 
 @torch.no_grad()
 def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections: Detections) -> RefinementTrace:
-    """Refine some cars and keep every state on the way. Takes twice as long as the refinement; gradients are off.
+    """Refine some cars and keep every state. This takes twice as long as a refinement; gradients are off.
 
-    The last state is where the images have each car; the result may lie between it and the detector's box.
+    The last state is the optimum of the images; the result may lie between it and the detector's box.
 
     Raises:
-        InputError: frames, detections and prior do not fit together; the method "box_alignment", which has no steps.
+        InputError: frames, detections and prior do not fit together, or the method is "box_alignment", which has no
+            steps.
     """
     if refiner.config.method == "box_alignment":
         raise InputError("method", "one that iterates", "box_alignment", "trace direct, geometric or combined")
@@ -119,7 +120,7 @@ def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections
 
 
 def _ends(minimum: Minimum[CarState]) -> list[CarState]:
-    """The states that the iterations led to: where the next one of the stage began, or where the stage ended."""
+    """The states after each iteration: where the next iteration of the stage began, or where the stage ended."""
     stage_ends = (*minimum.stage_starts[1:], minimum.end)
     took_part = minimum.cost_history.isfinite()
     ends = []
@@ -127,13 +128,13 @@ def _ends(minimum: Minimum[CarState]) -> list[CarState]:
     for number, (iteration, following) in enumerate(followed):
         end = stage_ends[iteration.stage]
         if following is not None and following.stage == iteration.stage:
-            # Cars that have left the batch by then are where their stage ended.
+            # Cars that left the batch before are in the state where their stage ended.
             end = where_rows(took_part[:, number + 1], following.state, end)
         ends.append(end)
     return ends
 
 
 def without_photometry(refiner: DirectShapeRefiner) -> DirectShapeRefiner:
-    """The same refiner with silhouettes and priors alone, whose poses drift (paper, fig. of the projection's drift)."""
+    """A refiner with silhouettes and priors only, whose poses drift (paper, figure of the projection's drift)."""
     config = refiner.config
     return DirectShapeRefiner(refiner.prior, replace(config, photometric=replace(config.photometric, weight=0.0)))

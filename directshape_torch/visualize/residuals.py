@@ -1,4 +1,4 @@
-"""What images and masks say of cars, pixel by pixel: the residuals of the energy, as values, colours and pictures."""
+"""This module computes the residuals of the energy for cars, pixel by pixel, as values, colours and pictures."""
 
 from __future__ import annotations
 
@@ -27,33 +27,33 @@ from directshape_torch.terms.term import Part, Sight
 from directshape_torch.visualize.drawing import Array, View, blue_white_red
 
 WORST_SILHOUETTE = 4.6
-"""-log 0.01: what a pixel pays whose mask is certain and wrong."""
+"""This is -log 0.01, the cost of a pixel whose mask is certain and wrong."""
 WORST_GREY_LEVELS = 30.0
-"""Differences of the images from here on have the full colour."""
+"""Image differences from this value on have the full colour."""
 
 _MOST_PIXELS = 8000
-# A pixel whose mask is sure and right pays about as much.
+# A pixel whose mask is certain and right has about this cost.
 _NOTHING_SILHOUETTE = 0.2
 _LOST: tuple[int, int, int] = (110, 110, 110)
-# Where a shape spills out of its mask, and where it does not fill it.
+# The first colour shows a shape outside its mask, the second a mask that the shape does not fill.
 _SPILLED, _UNFILLED = (np.array(c, dtype=np.float64) for c in ((255, 140, 0), (186, 60, 220)))
 _DARK = np.array([40.0, 40.0, 40.0])
 
 
 class PixelResiduals(NamedTuple):
-    """P pixels of one car with what the cost says of them."""
+    """A `PixelResiduals` has P pixels of one car with their residuals."""
 
     uv: NDArray[np.float64]  # (P, 2) full-resolution pixels
     value: NDArray[np.float64]  # (P,)
-    lost: NDArray[np.bool_]  # (P,) there is nothing to compare, and the pixel pays a constant
+    lost: NDArray[np.bool_]  # (P,) whether there is nothing to compare, so that the cost is constant
 
 
 class CarResiduals(NamedTuple):
-    """What the images say of one car; no pixels where there is no such term.
+    """A `CarResiduals` has the residuals of one car; a term that is absent has no pixels.
 
-    Silhouettes: `-log` of the probability of the mask, above 0 where the shape spills out of it, below where it does
-    not fill it; a ray that passes by is not lost. Photometric: right less left, grey levels, mean over the part of the
-    neighbourhood on the car.
+    Silhouette residuals are `-log` of the probability of the mask, positive where the shape is outside the mask and
+    negative where it does not fill the mask; no ray is lost. Photometric residuals are right less left image, grey
+    levels, averaged over the part of the neighbourhood on the car.
     """
 
     silhouette_left: PixelResiduals
@@ -61,13 +61,13 @@ class CarResiduals(NamedTuple):
     photometric: PixelResiduals
 
 
-# Of all cars: the place of the car of each pixel, and its uv, value and whether it is lost.
+# These are the car of each pixel, its uv, its value and whether it is lost, for all cars.
 _Pixels = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 @torch.no_grad()
 def car_residuals(stage: CarStage, pixels: Observation, sight: Sight) -> list[CarResiduals]:
-    """Residuals of R cars at what is seen of a state, at a stage that has begun with these pixels."""
+    """Residuals of R cars at an observed state, in a stage that has begun with these pixels."""
     figures, masks = stage.figures(sight), stage.problem.masks
     nothing = torch.zeros(0)
     parts: dict[str, _Pixels] = dict.fromkeys(
@@ -97,7 +97,7 @@ def _of_photometry(term: Photometric, at: Part, left: PixelSamples) -> _Pixels:
     counted = fixed.rows.pixel_weight > 0
     weight = fixed.rows.neighbour_weight.movedim(0, -1)
     mean = (at.residual * weight).sum(dim=-1) / weight.sum(dim=-1).clamp_min(1)
-    # A sight has the left pixels in the blocks into which they are packed.
+    # A `Sight` has the left pixels in their packed blocks.
     pixel = Rows.of_sorted(left.object_index, len(term.cars)).row.flatten()[fixed.sight_place]
     car = fixed.blocks.owner[:, None].expand_as(counted)
     return car[counted], left.uv[pixel[counted]], mean[counted], ~Surface(*at.where).usable[counted]
@@ -111,9 +111,9 @@ def residual_maps(
     rows: Tensor,  # (R,) detections that have a pose
     states: Iterable[tuple[Array, Array]],  # poses (R, 4, 4) and shapes (R, K)
 ) -> list[list[CarResiduals]]:
-    """For each of the states the residuals of R cars, at pixels that are evenly spaced over their regions.
+    """Residuals of R cars for each of the states, at pixels that are evenly spaced over their regions.
 
-    Masks are those of the detections; photometric pixels are those of the car as it is in the state.
+    Masks are from the detections; photometric pixels are from the car in the state.
     """
     sampling = replace(config.sampling, mode="uniform", mode_right="uniform", density=1.0, max_pixels=_MOST_PIXELS)
     config = replace(config, method="direct", compile="off", sampling=sampling)
@@ -131,22 +131,22 @@ def residual_maps(
 
 
 def silhouette_colours(values: PixelResiduals) -> NDArray[np.uint8]:
-    """(P, 3) orange where the shape spills out of its mask, violet where it does not fill it, dark where they agree."""
+    """Colours (P, 3): orange where the shape is outside its mask, violet where it does not fill it, else dark."""
     strength = np.clip(np.abs(values.value) / WORST_SILHOUETTE, 0, 1)[:, None] ** 0.7
     return _uint8(_DARK + strength * (np.where(values.value[:, None] > 0, _SPILLED, _UNFILLED) - _DARK))
 
 
 def photometric_colours(values: PixelResiduals) -> NDArray[np.uint8]:
-    """(P, 3) blue where the right image is darker, white where they agree, red where it is brighter; grey: lost."""
+    """Colours (P, 3): blue where the right image is darker, white on agreement, red where brighter, grey if lost."""
     colours = _uint8(blue_white_red(values.value, WORST_GREY_LEVELS))
     colours[values.lost] = _LOST
     return colours
 
 
 def draw_residuals(view: View, residuals: CarResiduals, name: str, share: float = 1.0) -> None:
-    """One kind of residuals as squares on its image, which becomes dark; silhouettes only where they differ.
+    """Draw one kind of residuals as squares on its image, which is darkened; silhouettes only where they differ.
 
-    A square is as large as a share of the distance of the pixels.
+    The side of a square is `share` of the distance between pixels.
     """
     view.picture[...] = view.picture.mean(axis=2, keepdims=True) * 0.5 + 24
     values, uv = getattr(residuals, name), residuals.silhouette_left.uv

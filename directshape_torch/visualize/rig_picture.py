@@ -1,4 +1,4 @@
-"""Picture of the estimates of rigs: the disparity field in bands, and what was measured at each car."""
+"""This module draws estimates of rigs: the disparity field in bands, and the measurement at each car."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _HULL = (120, 120, 120)
 def draw_rigs(
     rigs: Sequence[RigEstimate],  # at least one
 ) -> Picture:  # (H, W, 3) RGB
-    """One below the other: what was found in words, and the field with the detections' offsets less their own bias."""
+    """Pictures of rigs, one below the other: the estimate in words, and the field with offsets less detector bias."""
     pictures = []
     for rig in rigs:
         offset = rig.rows[:, 3] - rig.detector.bias * rig.rows[:, 2]
@@ -38,11 +38,11 @@ def draw_disparity_field(
     uv_left: Tensor,  # (P, 2) pixels of the data
     bias_px: Tensor,  # (P,) measured minus true disparity there
 ) -> Picture:  # (H + lines of text, W, 3) RGB
-    """The field with a dot a datum, which vanishes where they agree: blue negative, white zero, red positive."""
+    """The field with a dot for each datum, which vanishes on agreement: blue negative, white zero, red positive."""
     width, height = field.size_wh
     v, u = torch.meshgrid(torch.arange(0, height, 4), torch.arange(0, width, 4), indexing="ij")
     coarse = field.to(device="cpu", dtype=torch.float64).bias(torch.stack([u, v], dim=-1).double()).numpy()
-    # A quarter of the pixels: it is smooth.
+    # The field is smooth, so every fourth row and column is enough.
     values = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
     most = max(float(np.abs(values).max()), float(bias_px.abs().quantile(0.9)) if len(bias_px) else 0.0)
     limit = max(0.5, math.ceil(2 * most) / 2)
@@ -60,7 +60,7 @@ def draw_disparity_field(
 
 
 def _scale(limit: float, width: int) -> Picture:
-    """What the colours mean."""
+    """A strip that explains the colours."""
     strip = np.full((30, width, 3), GROUND, np.uint8)
     for place, level in enumerate(np.linspace(-limit, limit, 5)):
         u = 8 + place * width // 5

@@ -1,4 +1,4 @@
-"""The frames of a run with what went into them, as far as it is at hand and has not changed since."""
+"""This module gives the frames of a run with their inputs, as far as these are available and unchanged."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ _WORDS = {"image_left": "left image", "image_right": "right image", "ground_plan
 
 @dataclass(frozen=True)
 class RunInputs:
-    """A run and what else a page or an export may use.
+    """A `RunInputs` is a run with the other inputs of a page or an export.
 
     Raises:
-        InputError: the prior is not that of the run.
+        InputError: the prior is not the prior of the run.
     """
 
     run: RunFolder
-    prior: ShapePrior | None = None  # the shapes of the run; None: saved meshes or none
+    prior: ShapePrior | None = None  # shape prior of the run; None: saved meshes or no shapes
     # Images, calibrations, masks and detections of the run's frames; None: no pictures and no colours.
     dataset: StereoDataset | None = None
-    has_detections: bool = True  # whether the detections of that data set are those of the run, or others stand in
-    # What could not be used, and of which frames.
+    has_detections: bool = True  # whether the data set has the detections of the run, not substitutes
+    # Inputs that could not be used, with the frames.
     problems: dict[str, set[str]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -61,7 +61,7 @@ class RunInputs:
 
 
 class RunFrame:
-    """One finished frame of a run; its parts are read when they are first asked for.
+    """A `RunFrame` is one finished frame of a run; its parts are read on first use.
 
     Raises:
         DataFormatError: a file of the run is missing or damaged.
@@ -77,7 +77,7 @@ class RunFrame:
 
     @cached_property
     def detections(self) -> list[KittiObject] | None:
-        """The lines of its cars in the detection file."""
+        """The lines of the refined cars in the detection file, or None if it is not available or changed."""
         dataset = self.inputs.dataset
         if dataset is None or not self.inputs.has_detections:
             return None
@@ -91,13 +91,13 @@ class RunFrame:
 
     @property
     def labels(self) -> list[KittiObject] | None:
-        """The ground truth, which no run reads and so no hash can tell."""
+        """The ground truth; the run does not read it, so no hash can show changes."""
         dataset = self.inputs.dataset
         return None if dataset is None else dataset.layout.files(self.frame_id).read_labels()
 
     @cached_property
     def loaded(self) -> LoadedFrame | None:
-        """Images, camera, ground and masks, if they are those that went in."""
+        """Images, camera, ground and masks, or None if they are not available or changed."""
         dataset = self.inputs.dataset
         if dataset is None:
             return None
@@ -109,13 +109,13 @@ class RunFrame:
             found = dataset.layout.files(self.frame_id)
             self._are_unchanged({"image_left": found.left, "image_right": found.right})
             return None
-        # Of `detections` what stands in cannot be the same.
+        # Substitutes of `detections` cannot have the hash of the run.
         kept = {role: path for role, path in files.items() if role != "detections" or self.inputs.has_detections}
         return dataset.load(self.frame_id) if self._are_unchanged(kept) else None
 
     @cached_property
     def t_cam_ref(self) -> Tensor:
-        """`x_cam = x_ref + t_cam_ref` (3,), float64, from the states themselves; zero for a frame without cars."""
+        """`x_cam = x_ref + t_cam_ref` (3,), float64, from the states; zero for a frame without cars."""
         shapes = self.result.shapes
         if not len(shapes.input_lines):
             return torch.zeros(3, dtype=torch.float64)
@@ -124,14 +124,14 @@ class RunFrame:
 
     @cached_property
     def before(self) -> list[DrawnCar] | None:
-        """Its cars as they went in."""
+        """The cars before the refinement, or None without detections."""
         if self.detections is None:
             return None
         return cars_before(self.detections, self.t_cam_ref, self.inputs.mean, self.result.shapes.codes.shape[1])
 
     @cached_property
     def after(self) -> list[DrawnCar]:
-        """Its cars as the run left them."""
+        """The cars after the refinement."""
         shapes = self.result.shapes
         location_ref, rotation_y, hwl = (
             torch.from_numpy(x) for x in (shapes.boxes_location_ref, shapes.boxes_rotation_y, shapes.boxes_hwl)
@@ -146,7 +146,7 @@ class RunFrame:
         return true_corners(self.labels, self.inputs.run.classes, self.t_cam_ref)
 
     def _are_unchanged(self, files: Mapping[str, Path]) -> bool:
-        """Whether the files are those that the run read."""
+        """Whether the files are those that the run read; problems are noted."""
         found = [self._problem(role, path) for role, path in files.items()]
         for problem in filter(None, found):
             self._note(problem)
