@@ -1,1 +1,1 @@
-"""A finished run in the formats of other programs."""
+"""This package exports a finished run in the formats of other programs."""

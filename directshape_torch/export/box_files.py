@@ -1,4 +1,4 @@
-"""Boxes of a run in the files of KITTI, COCO with Omni3D's 3D fields, and nuScenes."""
+"""This module writes the boxes of a run as files of KITTI, of COCO with Omni3D's 3D fields, and of nuScenes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _KITTI_FRAME = "ref: KITTI's rectified camera 0, x right, y down, z forward, met
 
 
 class KittiExporter(Exporter):
-    """`kitti/data/NNNNNN.txt`, the result file byte for byte, and all its lines as `kitti/json/NNNNNN.json`."""
+    """A `KittiExporter` copies `kitti/data/NNNNNN.txt` unchanged and writes its lines as `kitti/json/NNNNNN.json`."""
 
     def add(self, source: FrameSource) -> None:
         frame, frame_id, folder = source.result, source.frame_id, self.folder / "kitti"
@@ -67,20 +67,20 @@ def _refinement(frame: FrameResult, line: KittiObject) -> dict[str, Any]:
 
 
 def _numbers(values: float | list[float]) -> Any:
-    """JSON has no NaN."""
+    """The values with None for NaN and infinity, which JSON does not have."""
     if isinstance(values, list):
         return [_numbers(value) for value in values]
     return values if math.isfinite(values) else None
 
 
-# Omni3D's order of the eight corners, in units of half (length, height, width) along x, y (down), z of the object.
+# These are Omni3D's eight corners, in units of half (length, height, width) along x, y (down), z of the object.
 _CORNERS = np.array(
     [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], np.float64
 )
 _UNKNOWN = -1
 
 KITTI_TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
-"""Category ids are places in this list, from 1; types that a detector adds come after them."""
+"""Category ids are positions in this list, from 1; other types of a detector follow."""
 
 _INFO = {
     "id": "0",
@@ -94,7 +94,7 @@ _INFO = {
 
 
 class Coco3dExporter(Exporter):
-    """`coco3d.json`: all frames, written at the end."""
+    """A `Coco3dExporter` writes `coco3d.json` with all frames at the end."""
 
     needs_images_for = "the sizes and intrinsics that coco3d lists"
 
@@ -127,7 +127,7 @@ class Coco3dExporter(Exporter):
 
 
 def _image_path(source: FrameSource) -> str:
-    """The left image, from the root of the data set where that is known."""
+    """The path of the left image, relative to the root of the data set if that is known."""
     dataset, root = source.inputs.dataset, source.options.data_root
     if dataset is None:
         raise InputError("--data", "the data set of the run, for the names of its images", "nothing")
@@ -136,7 +136,7 @@ def _image_path(source: FrameSource) -> str:
 
 
 def _detection_fields(one: ResultObject) -> dict[str, Any]:
-    """What plain COCO readers ask for, and what the detector and the refinement say."""
+    """The fields that plain COCO readers need, and the values of the detector and the refinement."""
     u_min, v_min, u_max, v_max = one.line.box_2d
     return {
         "bbox": [u_min, v_min, u_max - u_min, v_max - v_min],
@@ -189,9 +189,9 @@ DETECTION_NAMES = {
 }
 _MOST_BOXES = 500
 
-# Axes forward, left, up of a vehicle that looks along z of `ref`; the origin stays that of `ref`.
+# These are the axes forward, left, up of a vehicle that looks along z of `ref`; the origin is that of `ref`.
 _R_NUSCENES_REF = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-# nuScenes' boxes have length along x, width along y (left) and height along z (up); ours x, z and -y.
+# Boxes of nuScenes have length along x, width along y (left) and height along z (up); ours along x, z and -y.
 _R_OBJ_BOX = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 _NUSCENES_FRAME = (
@@ -201,7 +201,7 @@ _NUSCENES_FRAME = (
 
 
 class NuscenesExporter(Exporter):
-    """`nuscenes.json`: all frames, one sample a frame, its id as token; written at the end."""
+    """A `NuscenesExporter` writes `nuscenes.json` at the end, with one sample for each frame and its id as token."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -241,7 +241,7 @@ def _score(one: ResultObject) -> float:
 
 
 def image_numbers(frame_ids: Sequence[str]) -> dict[str, int]:
-    """KITTI's frame numbers as image ids, or 1, 2, .. where the ids are no numbers.
+    """KITTI's frame numbers as image ids, or 1, 2, .. if the ids are not distinct numbers.
 
     Examples:
         >>> image_numbers(["000107", "007322"])

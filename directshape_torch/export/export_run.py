@@ -1,4 +1,4 @@
-"""`export_run`: a finished run in the formats of other programs."""
+"""`export_run` writes a finished run in the formats of other programs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FORMATS: dict[str, type[Exporter]] = {
     "nuscenes": NuscenesExporter,
     "rerun": RerunExporter,
 }
-"""What `export_run` can write (docs/outputs.md)."""
+"""These are the formats of `export_run` (docs/outputs.md)."""
 
 
 def export_run(
@@ -36,16 +36,16 @@ def export_run(
     """Write the finished frames of a run in other formats (docs/outputs.md). The run itself is only read.
 
     Args:
-        inputs: which frames of which output folder, shape prior, and the images for colours.
-        folder: gets `glb`, `ply`, `points`, `kitti`, `coco3d.json`, `nuscenes.json`, `recording.rrd`; files of an
-            earlier export that have the same names are replaced.
-        formats: of `FORMATS`.
-        options: looks and details.
-        tell: called after each frame.
+        inputs: chosen frames of an output folder, shape prior, and the images for colours.
+        folder: folder of `glb`, `ply`, `points`, `kitti`, `coco3d.json`, `nuscenes.json`, `recording.rrd`; existing
+            files with the same names are replaced.
+        formats: names out of `FORMATS`.
+        options: appearance and details.
+        tell: function that is called after each frame.
 
     Raises:
-        MissingDependencyError: "rerun" without Rerun.
-        InputError: an unknown format, or one that needs images which were not given.
+        MissingDependencyError: "rerun" is chosen without Rerun.
+        InputError: a format is unknown, or needs images which were not given.
         DataFormatError: a file of the run or of the data set is missing, damaged or not that of the run.
     """
     run, options = inputs.run, ExportOptions() if options is None else options
@@ -61,7 +61,7 @@ def export_run(
         for exporter in exporters:
             stack.callback(exporter.abandon)
         for frame_id in run.frame_ids:
-            # What is read or made of a frame serves all of them.
+            # All exporters of a frame share what is read and computed.
             source = FrameSource(inputs, frame_id, options)
             for exporter in exporters:
                 exporter.add(source)

@@ -1,4 +1,4 @@
-"""What the exports of one frame are made of, and what an exporter is."""
+"""This module has the base class of exporters and the data of one frame that they share."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from directshape_torch.visualize.run_frames import RunFrame, RunInputs
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """What is chosen of an export."""
+    """An `ExportOptions` has the choices for an export."""
 
-    data_root: Path | None = None  # folder that names of images begin in, where a file lists them
-    # Repeats the refinement, for the iterations in a recording; then the detections must be the run's.
+    data_root: Path | None = None  # folder to which listed image paths are relative
+    # Refiner that repeats the refinement, for the iterations in a recording; it needs the detections of the run.
     refiner: DirectShapeRefiner | None = None
-    mirror: bool = True  # colour what the image does not show by the other side of the car
-    points_per_car: int = 10_000  # points spread over a surface
+    mirror: bool = True  # whether to colour unseen parts by the other side of the car
+    points_per_car: int = 10_000  # points sampled on a surface
 
     def __post_init__(self) -> None:
         if self.points_per_car < 1:
@@ -30,7 +30,7 @@ class ExportOptions:
 
 
 class FrameSource(RunFrame):
-    """One finished frame of a run for all of its exporters."""
+    """A `FrameSource` is one finished frame of a run for all of its exporters."""
 
     def __init__(self, inputs: RunInputs, frame_id: str, options: ExportOptions) -> None:
         super().__init__(inputs, frame_id)
@@ -38,10 +38,10 @@ class FrameSource(RunFrame):
 
     @cached_property
     def images(self) -> LoadedFrame | None:
-        """Images, calibration and masks, or None where no data set was given.
+        """Images, calibration and masks, or None without a data set.
 
         Raises:
-            DataFormatError: they are not those of the run.
+            DataFormatError: the files are not those of the run.
         """
         if self.loaded is None and self.inputs.dataset is not None:
             problems = ", ".join(sorted(self.inputs.problems))
@@ -50,7 +50,7 @@ class FrameSource(RunFrame):
 
     @property
     def with_images(self) -> LoadedFrame:
-        """The same, for an exporter that asked for a data set."""
+        """Images, calibration and masks, for an exporter that needs them."""
         assert self.images is not None, "no data set"
         return self.images
 
@@ -59,7 +59,7 @@ class FrameSource(RunFrame):
         """Surfaces with colours.
 
         Raises:
-            InputError: the shapes of the run were not given.
+            InputError: the shape prior of the run was not given.
         """
         if self.inputs.prior is None:
             raise InputError("--prior", "the shape prior of the run", "nothing")
@@ -67,13 +67,13 @@ class FrameSource(RunFrame):
 
 
 class Exporter:
-    """Writes a run in one format, below a folder.
+    """An `Exporter` writes a run in one format into a folder.
 
     Raises:
-        InputError: what needs images has no data set.
+        InputError: the exporter needs images but there is no data set.
     """
 
-    needs_images_for = ""  # what the images are for, where it cannot do without
+    needs_images_for = ""  # purpose of the images if the exporter needs them
 
     def __init__(self, folder: Path, inputs: RunInputs, options: ExportOptions) -> None:
         if self.needs_images_for and inputs.dataset is None:
@@ -81,11 +81,11 @@ class Exporter:
         self.folder, self.inputs, self.options = folder, inputs, options
 
     def add(self, source: FrameSource) -> None:
-        """Take the next frame."""
+        """Add the next frame."""
         raise NotImplementedError
 
     def finish(self) -> None:
-        """Write what can only be written at the end."""
+        """Write the parts that need all frames."""
 
     def abandon(self) -> None:
-        """A frame failed, or another exporter's end: leave nothing half-written behind."""
+        """Remove unfinished files, because a frame or another exporter failed."""

@@ -1,4 +1,4 @@
-"""Surfaces and surface points of refined cars with the colours of the left image where it shows them."""
+"""This module colours surfaces and surface points of refined cars by the left image."""
 
 from __future__ import annotations
 
@@ -29,31 +29,31 @@ Points = NDArray[np.float64]
 
 NEUTRAL_RGB = (150, 150, 150)
 NEUTRAL, MIRRORED, SEEN = 0, 1, 2
-"""Where a colour comes from: nowhere, the other side of the car, the image."""
+"""These are the sources of a colour: none, the other side of the car, the image."""
 
-# A vertex has one colour, so the mesh is made finer until an edge is about as long as this in the image.
+# A vertex has one colour, so the mesh is refined until an edge has about this length in the image.
 _EDGE_PX = 2.5
 _MOST_SUBDIVISIONS = 2
-# How far from the mirrored place a seen point may lie to lend its colour; about an edge of the mesh.
+# A seen point within this distance of a mirrored point lends it its colour; it is about an edge of the mesh.
 _MIRROR_REACH_M = 0.12
-# How much deeper than the first surface on its ray a point may lie and still be that surface: mesh and field differ.
+# A point this much deeper than the first surface on its ray still counts as visible, since mesh and field differ.
 _SAME_SURFACE_M = 0.03
-# Where the surface turns away from the camera, the smallest error of the fit shows what is beside the car.
+# At more grazing views a small error of the fit would take colours from beside the car.
 _LEAST_RAY_COSINE = 0.2
 _SEED = 0
 _ALL_POINTS = 10_000_000
-# Of the grid on the ground.
+# These are sizes of the grid on the ground.
 _SPACING_M, _STRIP_WIDTH_M = 5.0, 0.04
 _X_M, _Z_M = (-20.0, 20.0), (0.0, 50.0)
 
 
 @dataclass(frozen=True)
 class FrameView:
-    """The left image of a frame and the refined cars that it shows."""
+    """A `FrameView` is the left image of a frame with the refined cars in it."""
 
     left: View
-    cars: Sequence[EstimatedCar]  # which hide themselves and one another
-    masks: Sequence[NDArray[np.bool_] | None]  # (H, W) left pixels known to show each car, None where nothing is known
+    cars: Sequence[EstimatedCar]  # they may hide themselves and one another
+    masks: Sequence[NDArray[np.bool_] | None]  # (H, W) left pixels that show each car, None if unknown
 
     def is_seen(
         self,
@@ -61,7 +61,7 @@ class FrameView:
         points_cam: Points,  # (N, 3) on the surface of the car, metres
         normals_cam: Points,  # (N, 3) outward
     ) -> NDArray[np.bool_]:  # (N,)
-        """Which points the camera sees: turned towards it, in the image, on the car's mask, and hidden by no car."""
+        """Whether points are visible: facing the camera, in the image, on the car's mask, and not hidden by a car."""
         distance = np.linalg.norm(points_cam, axis=1)
         cosine = -(points_cam * normals_cam).sum(axis=1) / np.maximum(distance, 1e-9)
         height, width = self.left.picture.shape[:2]
@@ -74,12 +74,12 @@ class FrameView:
         for other in (car, *(row for row in range(len(self.cars)) if row != car)):
             rows = np.flatnonzero(seen)
             depth = self.cars[other].points_at_pixels(uv[rows].astype(np.float64), torch.from_numpy(self.left.K))[:, 2]
-            # A ray that passes a car by has depth NaN, which hides nothing.
+            # A ray that misses a car has depth NaN, which hides nothing.
             seen[rows[depth < points_cam[rows, 2] - _SAME_SURFACE_M]] = False
         return np.asarray(seen)
 
     def colours(self, points_cam: Points) -> NDArray[np.uint8]:
-        """The image's colours (N, 3) at the points, sRGB, between the four nearest pixels."""
+        """The image's colours (N, 3) at the points, sRGB, interpolated bilinearly."""
         from scipy.ndimage import map_coordinates
 
         at, image = self.left.project(points_cam).T[::-1], self.left.picture
@@ -88,20 +88,20 @@ class FrameView:
 
 
 class Paint(NamedTuple):
-    """Colours of N surface points."""
+    """A `Paint` has the colours of N surface points."""
 
     rgb: NDArray[np.uint8]  # (N, 3) sRGB
-    source: NDArray[np.uint8]  # (N,) 2 seen in the image, 1 mirrored by the car's plane of symmetry, 0 neutral grey
+    source: NDArray[np.uint8]  # (N,) 2 seen in the image, 1 mirrored at the car's plane of symmetry, 0 neutral grey
 
 
 class PaintedFrame:
-    """The refined cars of a frame with the colours of its left image.
+    """A `PaintedFrame` has the refined cars of a frame with the colours of its left image.
 
     Args:
-        frame: what the run left.
-        prior: the one that the refinement used.
-        loaded: the frame's images, calibration and masks; None leaves everything neutral.
-        mirror: give a point that is not seen the colour of its mirror image where that is seen.
+        frame: results of the run.
+        prior: the prior of the refinement.
+        loaded: images, calibration and masks of the frame; None gives neutral colours.
+        mirror: whether an unseen point gets the colour of its mirror image if that is seen.
     """
 
     def __init__(self, frame: FrameResult, prior: ShapePrior, loaded: LoadedFrame | None, mirror: bool = True) -> None:
@@ -120,7 +120,7 @@ class PaintedFrame:
     def mesh(self, index: int, finer: bool = False) -> tuple[trimesh.Trimesh, Paint]:
         """Surface of `objects[index]` in the left camera frame, and the colours of its vertices.
 
-        If `finer`, the triangles are divided, without moving the surface, until colours are as fine as the image.
+        If `finer`, triangles are divided, without a change of the surface, until colours are as fine as the image.
         """
         mesh = self._mesh(index)
         if finer and self.view is not None:
@@ -128,8 +128,10 @@ class PaintedFrame:
         return mesh, self._paint(index, mesh.vertices, mesh.vertex_normals)
 
     def samples(self, index: int, count: int) -> tuple[Points, Points, Paint]:
-        """Points (count, 3) spread evenly by area over the surface of `objects[index]`, always the same ones; the
-        outward normals of their triangles (count, 3); colours."""
+        """Points (count, 3) on the surface of `objects[index]`, normals (count, 3) of their triangles, and colours.
+
+        Points are uniform by area and the same in every call; normals point outwards.
+        """
         from trimesh.sample import sample_surface
 
         mesh = self._mesh(index)
@@ -138,9 +140,9 @@ class PaintedFrame:
         return points_cam, normals_cam, self._paint(index, points_cam, normals_cam)
 
     def stereo_points(self) -> dict[int, tuple[Points, NDArray[np.uint8]]]:
-        """What dense stereo measures on each car, by its line number: points (N, 3), metres, and colours (N, 3).
+        """Points (N, 3), metres, and colours (N, 3) of dense stereo on each car, by its line number.
 
-        They are chosen as the point cloud methods of the refinement choose them, the rig's known bias taken off.
+        They are selected as for the point cloud methods of the refinement, after the rig's known bias is subtracted.
         """
         if self.loaded is None or self.view is None:
             return {}
@@ -174,7 +176,7 @@ class PaintedFrame:
 
 
 def _masks_of_lines(loaded: LoadedFrame) -> dict[int, NDArray[np.bool_]]:
-    """The left mask (H, W) of each line that has one, without its outermost pixels, which also show what is beside."""
+    """The left mask (H, W) of each line that has one, without the outermost pixels, which also show the background."""
     import cv2
 
     detections, masks = loaded.detections, {}
@@ -195,7 +197,7 @@ def _subdivided(mesh: trimesh.Trimesh, view: FrameView) -> trimesh.Trimesh:
 
 
 def _mirror(paint: Paint, points_obj: Points) -> None:
-    """Lend each unseen point the colour of the seen point next to its mirror image (x, y, -z) in the object frame."""
+    """Give each unseen point the colour of the seen point near its mirror image (x, y, -z) in the object frame."""
     from scipy.spatial import KDTree
 
     seen, unseen = np.flatnonzero(paint.source == SEEN), np.flatnonzero(paint.source == NEUTRAL)
@@ -213,7 +215,7 @@ def ground_grid(
     normal: Tensor,  # (3,) pointing up
     offset: float,  # metres
 ) -> trimesh.Trimesh:
-    """Strips of constant x and z, 5 m apart, on the plane `normal . x_cam + offset = 0`, seen from both sides."""
+    """Strips of constant x and z, 5 m apart, on the plane `normal . x_cam + offset = 0`, visible from both sides."""
     import trimesh
 
     n = normal.detach().double().cpu().numpy()
@@ -223,7 +225,7 @@ def ground_grid(
     xz = np.array([[(x0, z0), (x1, z0), (x1, z1), (x0, z1)] for x0, x1, z0, z1 in strips]).reshape(-1, 2)
     y = -(n[0] * xz[:, 0] + n[2] * xz[:, 1] + offset) / n[1]
     vertices = np.stack([xz[:, 0], y, xz[:, 1]], axis=1)
-    # Two triangles a strip and the same two from behind; of these the normals would cancel.
+    # A strip has two triangles for each side. Normals are given, because computed ones would cancel.
     upper = 4 * np.arange(len(strips))[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
     faces = np.concatenate([upper, upper[..., ::-1]]).reshape(-1, 3)
     up = np.tile(n / np.linalg.norm(n), (len(vertices), 1))

@@ -1,4 +1,4 @@
-"""A run as a Rerun recording: frames on one timeline, the iterations of their refinements on another."""
+"""This module writes a run as a Rerun recording: frames on one timeline, iterations of refinements on another."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from directshape_torch.visualize.residuals import CarResiduals, photometric_colo
 if TYPE_CHECKING:
     import trimesh
 
-# The timelines: numbers of frames; iterations of all frames, one after another.
+# The timelines are numbers of frames, and iterations of all frames in sequence.
 _FRAME, _ITERATION = "frame", "iteration"
 _STATES_PER_SECOND = 3.0
 _LEFT, _RIGHT = "world/cam/image", "right/image"
@@ -37,12 +37,12 @@ _JPEG_QUALITY = 90
 _MASK_OPACITY = 0.35
 _MOST_LINES = 255
 _DOT_PX = 1.6
-# Not the colour of the boxes that the run ended with.
+# This colour differs from the boxes of the result.
 _STATE_RGB = (120, 220, 235)
 
 
 class RerunExporter(Exporter):
-    """`recording.rrd`: all frames, and with a refiner the states that they go through when it refines them again.
+    """A `RerunExporter` writes `recording.rrd`: all frames, and with a refiner the states of a repeated refinement.
 
     Raises:
         MissingDependencyError: Rerun is not installed.
@@ -59,7 +59,7 @@ class RerunExporter(Exporter):
     def add(self, source: FrameSource) -> None:
         loaded, refiner = source.with_images, self.options.refiner
         if self._stream is None:
-            # The images of the first frame say what the viewer's views are fitted to.
+            # The viewer's views are fitted to the image size of the first frame.
             height, width = loaded.frame.sizes[0].tolist()
             self._stream = _Stream(self.folder / "recording.rrd", (width, height), refiner is not None)
             _log_conventions(self._stream)
@@ -72,7 +72,7 @@ class RerunExporter(Exporter):
         stream.at(frame)
         _clear_cars(stream)
         for index, one in enumerate(source.painted.objects):
-            # Under one name through all frames of a track.
+            # All frames of a track use one name.
             track = source.result.shapes.tracks[one.car]
             surface, paint = source.painted.mesh(index)
             stream.log_mesh(f"world/cars/{f'track_{track}' if track else one.line.line_number}", surface, paint.rgb)
@@ -97,7 +97,7 @@ class RerunExporter(Exporter):
     def finish(self) -> None:
         if self._stream is not None:
             self._stream.close()
-            # What is in its place is not for `abandon`.
+            # A finished file must not be removed by `abandon`.
             self._stream = None
 
     def abandon(self) -> None:
@@ -106,9 +106,9 @@ class RerunExporter(Exporter):
 
 
 def _log_conventions(stream: _Stream) -> None:
-    """The world is the left camera frame: x right, y down, z forward, metres. Masks have the numbers of lines."""
+    """Log the left camera frame as world (x right, y down, z forward, metres), and line numbers as mask classes."""
     stream.log("world", stream.rr.ViewCoordinates.RDF, static=True)
-    # The viewer gives each number a colour of its own.
+    # The viewer gives each number its own colour.
     classes: list[Any] = [(0, "no car", (0, 0, 0, 0))]
     classes += [(number, f"car {number}") for number in range(1, _MOST_LINES + 1)]
     for entity in (_LEFT, _RIGHT):
@@ -116,17 +116,17 @@ def _log_conventions(stream: _Stream) -> None:
 
 
 def _clear_cars(stream: _Stream) -> None:
-    """Take away what the cars of other frames left at the present places."""
+    """Clear the cars of other frames at the current places."""
     for entity in ("world/cars", "world/boxes/iteration", *_RESIDUALS):
         stream.log(entity, stream.rr.Clear(recursive=True))
 
 
 def _log_images(stream: _Stream, loaded: LoadedFrame) -> None:
-    """Both images with the camera, and on them the pixels of each car by the number of its line, 0 for none."""
+    """Log both images with the camera, and masks whose values are line numbers of the cars, 0 for none."""
     rr, frame, detections = stream.rr, loaded.frame, loaded.detections
     height, width = frame.sizes[0].tolist()
     K_image = frame.camera.K_left[0].double().cpu().numpy().copy()
-    # Rerun's pixels have their corners at whole numbers, ours their centres.
+    # Pixels of Rerun have their corners at whole numbers, ours their centres.
     K_image[:2, 2] += 0.5
     axes = rr.ViewCoordinates.RDF
     stream.log("world/cam", rr.Pinhole(image_from_camera=K_image, resolution=[width, height], camera_xyz=axes))
@@ -140,7 +140,7 @@ def _log_images(stream: _Stream, loaded: LoadedFrame) -> None:
 
 
 def _log_boxes(stream: _Stream, source: FrameSource) -> None:
-    """Those that went in, of the truth, and of the result, where grey ones were not refined."""
+    """Log the boxes of the input, of the truth, and of the result, with grey for cars that were not refined."""
     before = source.before or []
     corners = np.array([car.corners_cam for car in before])
     stream.log_boxes("world/boxes/before", corners, [ORANGE] * len(before), [f"{car.line}" for car in before])
@@ -157,7 +157,7 @@ def _log_boxes(stream: _Stream, source: FrameSource) -> None:
 
 
 def _log_state(stream: _Stream, trace: RefinementTrace, number: int, lines: Sequence[int]) -> None:
-    """Surfaces, boxes and residuals of all cars in a state; what a car shares with the one before stays."""
+    """Log surfaces, boxes and residuals of the cars in a state; only cars that moved are logged again."""
     rows = trace.rows.tolist()
     cars = cars_of_result(trace.moment(number)[trace.rows], [lines[row] for row in rows])
     corners = np.array([car.corners_cam for car in cars])
@@ -171,10 +171,10 @@ def _log_state(stream: _Stream, trace: RefinementTrace, number: int, lines: Sequ
 
 
 def _log_residuals(stream: _Stream, line: int, residuals: CarResiduals) -> None:
-    """Sampled pixels coloured by what they cost: silhouettes in both images, photometry in the left one."""
+    """Log sampled pixels coloured by residual: silhouettes in both images, photometry in the left one."""
     for name, values in zip(_RESIDUALS, residuals, strict=True):
         colours = photometric_colours if values is residuals.photometric else silhouette_colours
-        # Rerun's pixels have their corners at whole numbers, ours their centres.
+        # Pixels of Rerun have their corners at whole numbers, ours their centres.
         stream.log(f"{name}/{line}", stream.rr.Points2D(values.uv + 0.5, colors=colours(values), radii=_DOT_PX))
 
 
@@ -195,7 +195,7 @@ def _import_rerun() -> Any:
 
 
 class _Stream:
-    """Writes a recording beside its place, and moves it there when it is whole."""
+    """A `_Stream` writes a recording to a temporary file, and moves it to its path when it is complete."""
 
     def __init__(self, path: Path, size_wh: tuple[int, int], with_iterations: bool) -> None:
         self.rr, self.path = _import_rerun(), path
@@ -203,23 +203,23 @@ class _Stream:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._stream = self.rr.RecordingStream("directshape", send_properties=False)
         self._stream.save(self._temporary, default_blueprint=_blueprint(size_wh, with_iterations))
-        # When a line was written says nothing about the refinement.
+        # The time of logging does not belong to the refinement.
         self._stream.set_log_time_enabled(False)
         self._stream.set_log_tick_enabled(False)
 
     def at(self, frame: int | None = None, iteration: int | None = None) -> None:
-        """What is logged from here on belongs to these places of the two timelines, or to none of theirs."""
+        """Set the places on the two timelines for what is logged next; a None is no place on that timeline."""
         self._stream.reset_time()
         for timeline, place in ((_FRAME, frame), (_ITERATION, iteration)):
             if place is not None:
                 self._stream.set_time(timeline, sequence=place)
 
     def log(self, entity: str, *archetypes: Any, static: bool = False) -> None:
-        """Log at the present places; `static` for what holds at all times. What Rerun does not take raises."""
+        """Log at the current places, or for all times if `static`; values that Rerun does not accept raise."""
         self._stream.log(entity, *archetypes, static=static, strict=True)
 
     def log_mesh(self, entity: str, mesh: trimesh.Trimesh, colours: NDArray[np.uint8] | Colour) -> None:
-        """Triangles with a colour for each vertex, or one for all."""
+        """Log triangles with a colour for each vertex, or one colour for all."""
         of_all = isinstance(colours, tuple)
         made = self.rr.Mesh3D(
             vertex_positions=np.asarray(mesh.vertices, dtype=np.float32),
@@ -237,13 +237,13 @@ class _Stream:
         colours: Sequence[Colour],
         labels: Sequence[str],
     ) -> None:
-        """Boxes with length, height, width along the axes of their objects."""
+        """Log boxes with length, height, width along the axes of their objects."""
         from scipy.spatial.transform import Rotation
 
         corners = corners_cam.astype(np.float64).reshape(-1, 8, 3)
         axes = corners[:, :1] - corners[:, [3, 4, 1]]
         sizes = np.linalg.norm(axes, axis=2)
-        # Axes are rows here.
+        # Axes are rows here, so the matrix is that of the inverse rotation.
         inverse = Rotation.from_matrix(axes / sizes[:, :, None]) if len(axes) else None
         boxes = self.rr.Boxes3D(
             centers=corners.mean(axis=1),
@@ -257,7 +257,7 @@ class _Stream:
         self.log(entity, boxes)
 
     def close(self, keep: bool = True) -> None:
-        """Write the end and move the file to its place, or leave none behind."""
+        """Write the end and move the file to its path, or remove it."""
         self._stream.flush()
         self._stream.disconnect()
         if keep:
@@ -267,7 +267,7 @@ class _Stream:
 
 
 def _blueprint(size_wh: tuple[int, int], with_iterations: bool) -> Any:
-    """3D view on the left; images on the right, and with iterations residuals and costs."""
+    """A layout with a 3D view on the left, images on the right, and with iterations also residuals and costs."""
     import rerun.blueprint as rrb
 
     bounds = rrb.VisualBounds2D(x_range=[0, size_wh[0]], y_range=[0, size_wh[1]])
@@ -287,7 +287,7 @@ def _blueprint(size_wh: tuple[int, int], with_iterations: bool) -> Any:
         views.append(rrb.TimeSeriesView(origin="cost", name="cost of each car"))
     else:
         views.append(seen_right)
-    # Above and behind the camera, so that the street lies ahead.
+    # The eye is above and behind the camera and looks along the street.
     eye = rrb.EyeControls3D(position=[-7.0, -8.0, -9.0], look_target=[1.0, 1.0, 14.0], eye_up=[0.0, -1.0, 0.0])
     timeline = _ITERATION if with_iterations else _FRAME
     return rrb.Blueprint(

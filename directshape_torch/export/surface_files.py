@@ -1,4 +1,4 @@
-"""Painted cars as files: glTF scenes of a frame and of a car that moves along its track; surfaces and points as PLY."""
+"""This module writes painted cars as glTF scenes of frames and of moving cars, and as PLY surfaces and points."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ _CAR, _CAMERA = "car", "left camera"
 
 
 class GlbExporter(Exporter):
-    """`glb/NNNNNN.glb`, a scene of each frame, and one of each car that shares its shape over several frames."""
+    """A `GlbExporter` writes `glb/NNNNNN.glb`, a scene of each frame, and one of each car with a shared shape."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
         self._moving: dict[tuple[str, int], _MovingCar] = {}
 
     def add(self, source: FrameSource) -> None:
-        # Frames come sequence by sequence; a car keeps the picture of its nearest view until its own is over.
+        # Frames come sequence by sequence, and a car is kept until its sequence is over.
         self._write([key for key in self._moving if not source.frame_id.startswith(_sequence(key[0]))])
         painted = source.painted
         write_bytes(self.folder / "glb" / f"{source.frame_id}.glb", frame_glb(painted, source.images))
@@ -51,15 +51,15 @@ class GlbExporter(Exporter):
         for track, part in over:
             car = self._moving.pop((track, part))
             if len(car.T_cam_obj) > 1:
-                # The later parts of a track that was split are other cars.
+                # Later parts of a track that was split are other cars.
                 name = f"track_{track}_part{part}" if part else f"track_{track}"
                 write_bytes(self.folder / "glb" / f"{name}.glb", car.glb(_sequence(track)))
 
 
 def frame_glb(painted: PaintedFrame, loaded: LoadedFrame | None) -> bytes:
-    """All refined cars of a frame, painted, on a grid of 5 m where the frame's ground is known.
+    """All refined cars of a frame, painted, with a 5 m grid if the frame's ground is known.
 
-    Nodes turn the vertices, which are in the left camera frame, metres, to glTF's axes (y up).
+    Nodes rotate the vertices from the left camera frame, metres, to glTF's axes (y up).
     """
     import trimesh
 
@@ -76,19 +76,19 @@ def frame_glb(painted: PaintedFrame, loaded: LoadedFrame | None) -> bytes:
 
 
 def _time_s(source: FrameSource) -> float:
-    """When the frame was taken, NaN where nobody knows."""
+    """The time of the frame, NaN if it is not known."""
     dataset = source.inputs.dataset
     time_s = None if dataset is None else dataset.layout.files(source.frame_id).read_motion()[0]
     return np.nan if time_s is None else time_s
 
 
 def _sequence(track: str) -> str:
-    """What the names of the track and of its frames begin with, "" for a single sequence."""
+    """The common prefix of the names of a track and of its frames, "" for a single sequence."""
     return track.rpartition("_")[0]
 
 
 class _MovingCar:
-    """A car in several frames; its surface and colours are those of the nearest view."""
+    """A `_MovingCar` is a car in several frames, with the surface and colours of its nearest view."""
 
     def __init__(self) -> None:
         self.T_cam_obj: dict[str, NDArray[np.float64]] = {}
@@ -103,7 +103,7 @@ class _MovingCar:
             self._depth_m, self._nearest = float(T_cam_obj[2, 3]), (painted, index)
 
     def glb(self, sequence: str) -> bytes:
-        """The car at the origin of a node that moves in the left camera frame, below one that turns it to y up."""
+        """A scene with a car at the origin of a node that moves in the left camera frame, below a node with y up."""
         import trimesh
 
         painted, index = self._nearest
@@ -117,7 +117,7 @@ class _MovingCar:
         _add(scene, _CAR, mesh, paint, _CAMERA)
         numbers = image_numbers([frame_id.removeprefix(f"{sequence}_") for frame_id in self.T_cam_obj])
         seconds, T_views = np.array(self.time_s), np.stack(list(self.T_cam_obj.values()))
-        # Not of times that are unknown, nor of those that do not go on, which no glTF animation may have.
+        # Unknown times and times that do not increase are not used, since glTF animations must not have them.
         if not (np.diff(seconds) > 0).all():
             seconds = _SECONDS_A_FRAME * np.array(list(numbers.values()))
         return _glb(scene, lambda buffers, tree: _animate(buffers, tree, seconds - seconds[0], T_views))
@@ -129,7 +129,7 @@ def _animate(
     seconds: NDArray[np.float64],  # (F,) rising
     T_cam_obj: NDArray[np.float64],  # (F, 4, 4)
 ) -> None:
-    """Let the car's node go through its poses; trimesh, which writes no animations, calls this with all it wrote."""
+    """Animate the car's node; trimesh writes no animations itself, but calls this with its buffers and tree."""
     from scipy.spatial.transform import Rotation
 
     node = next(number for number, each in enumerate(tree["nodes"]) if each["name"] == _CAR)
@@ -138,7 +138,7 @@ def _animate(
     tree["accessors"]["times"] |= {"min": [float(seconds[0])], "max": [float(seconds[-1])]}
     tree["animations"] = [{"name": "track", "channels": [], "samplers": []}]
     for number, (name, values) in enumerate(moves.items()):
-        # Viewers that play nothing show the first frame.
+        # Viewers without animation show the first frame.
         tree["nodes"][node][name] = values[0].tolist()
         sampler = {"input": times, "output": _accessor(buffers, tree, name, values), "interpolation": "LINEAR"}
         tree["animations"][0]["samplers"].append(sampler)
@@ -146,7 +146,7 @@ def _animate(
 
 
 def _accessor(buffers: MutableMapping[str, bytes], tree: dict[str, Any], name: str, values: NDArray[np.float64]) -> int:
-    """The number of a new accessor to some numbers."""
+    """The index of a new accessor for the values."""
     buffers[name] = values.astype("<f4").tobytes()
     of = {"bufferView": len(buffers) - 1, "componentType": _FLOAT, "count": len(values)}
     kind = "SCALAR" if values.ndim == 1 else f"VEC{values.shape[1]}"
@@ -155,7 +155,7 @@ def _accessor(buffers: MutableMapping[str, bytes], tree: dict[str, Any], name: s
 
 
 def _extras(one: ResultObject, frame: FrameResult) -> dict[str, Any]:
-    """What is said of a car beside its surface, for `extras`."""
+    """Values of a car for `extras`."""
     return {
         "frame_id": frame.frame_id,
         "line": one.line.line_number,
@@ -167,7 +167,7 @@ def _extras(one: ResultObject, frame: FrameResult) -> dict[str, Any]:
 
 
 def _srgb_to_linear(rgb: NDArray[np.uint8]) -> NDArray[np.uint16]:
-    """Image colours as the linear ones (0..65535) that glTF asks for at vertices."""
+    """Image colours as the linear colours (0..65535) that glTF needs at vertices."""
     s = rgb.astype(np.float64) / 255
     linear = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
     return np.asarray(np.round(65535 * linear).astype(np.uint16))
@@ -181,7 +181,7 @@ def _glb(scene: trimesh.Scene, extend: Callable[..., None] | None = None) -> byt
 
 
 def _add(scene: trimesh.Scene, name: str, mesh: trimesh.Trimesh, paint: Paint, below: str | None = None) -> None:
-    """Below a node, or in the left camera frame."""
+    """Add a painted mesh to a scene, below a node or in the left camera frame."""
     opaque = np.full((len(paint.rgb), 1), 65535, dtype=np.uint16)
     mesh.vertex_attributes[_LINEAR] = np.concatenate([_srgb_to_linear(paint.rgb), opaque], axis=1)
     mesh.vertex_attributes[_SOURCE] = paint.source.astype(np.float32)
@@ -190,7 +190,7 @@ def _add(scene: trimesh.Scene, name: str, mesh: trimesh.Trimesh, paint: Paint, b
 
 
 def _finish(tree: dict[str, Any]) -> None:
-    """Colours of 16 bits, which trimesh has no way to ask for, and a material that is no metal."""
+    """Set 16-bit colours, for which trimesh has no option, and a non-metallic material."""
     if "meshes" not in tree:
         return
     looks = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
@@ -206,7 +206,7 @@ def _finish(tree: dict[str, Any]) -> None:
 
 
 class PlyExporter(Exporter):
-    """`ply/NNNNNN_LINE.ply`: the surface of each refined car, with normals, sRGB and `color_source` (see `Paint`)."""
+    """A `PlyExporter` writes `ply/NNNNNN_LINE.ply`: surfaces with normals, sRGB and `color_source` (see `Paint`)."""
 
     def add(self, source: FrameSource) -> None:
         for index, one in enumerate(source.painted.objects):
@@ -215,7 +215,7 @@ class PlyExporter(Exporter):
 
 
 class PointsExporter(Exporter):
-    """`points/NNNNNN_LINE.ply` of each refined car, and beside it `.._stereo.ply` where stereo saw any."""
+    """A `PointsExporter` writes `points/NNNNNN_LINE.ply` of each car, and `.._stereo.ply` if stereo has points."""
 
     def add(self, source: FrameSource) -> None:
         import trimesh
@@ -233,7 +233,7 @@ class PointsExporter(Exporter):
 
 
 def _ply(mesh: trimesh.Trimesh, paint: Paint, with_normals: bool = True) -> bytes:
-    """A surface or, without triangles, points."""
+    """A surface or, without triangles, points, as PLY."""
     from trimesh.exchange.ply import export_ply
     from trimesh.visual import ColorVisuals
 
