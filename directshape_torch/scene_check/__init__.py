@@ -1,1 +1,1 @@
-"""What is wrong with a stereo scene, measured from its images, calibration, masks and boxes."""
+"""This package finds mistakes in a stereo scene from its images, calibration, masks and boxes."""

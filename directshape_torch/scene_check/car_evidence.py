@@ -1,4 +1,4 @@
-"""What is known of each detected car in the image, to hold its 3D box against."""
+"""This module collects what is known of each detected car in the image, to check its 3D box."""
 
 from __future__ import annotations
 
@@ -25,32 +25,32 @@ Pair = tuple[NDArray[np.uint8], NDArray[np.uint8]]  # left and right image, (H, 
 
 @dataclass(frozen=True)
 class CarBoxes:
-    """N boxes as they are given."""
+    """A `CarBoxes` has N boxes with unchecked values."""
 
     location: Floats  # (N, 3) metres
     hwl: Floats  # (N, 3) the three lengths in the order of the file, metres
-    rotation_y: Floats  # (N,) radians, or what stands there
-    alpha: Floats  # (N,) radians, or what stands there; NaN where nobody gives it
-    box_2d: Floats  # (N, 4) u_min, v_min, u_max, v_max, or what stands there, pixels
+    rotation_y: Floats  # (N,) radians, if the file is right
+    alpha: Floats  # (N,) radians, if the file is right; NaN if not given
+    box_2d: Floats  # (N, 4) u_min, v_min, u_max, v_max, pixels, if the file is right
 
     def __len__(self) -> int:
         return len(self.location)
 
     def chosen(self, rows: Sequence[int]) -> CarBoxes:
-        """Some of the boxes, in that order."""
+        """The boxes of the given rows, in their order."""
         return CarBoxes(*(values[rows] for values in vars(self).values()))
 
 
-# A LiDAR's axes as a camera's: x forward, y left, z up become x right, y down, z forward.
+# The axes of a LiDAR become those of a camera: x forward, y left, z up become x right, y down, z forward.
 T_CAMERA_LIDAR: Floats = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
 class Scan(NamedTuple):
-    """The points of a LiDAR as they are given."""
+    """A `Scan` has the unchecked points of a LiDAR."""
 
-    points: Mapping[int, NDArray[Any]]  # (P, 3) by the number of columns that the numbers of the file are read with
+    points: Mapping[int, NDArray[Any]]  # (P, 3) by the number of columns with which the file is read
     T_cam_lidar: Floats  # (4, 4) from x forward, y left, z up to the left camera
-    columns: int = 4  # that a point has as documented
+    columns: int = 4  # documented number of columns
 
     @property
     def given(self) -> NDArray[Any]:  # (P, 3)
@@ -60,31 +60,31 @@ class Scan(NamedTuple):
 
 @dataclass(frozen=True)
 class FrameEvidence:
-    """The N boxes of a frame and the masks that belong to them."""
+    """A `FrameEvidence` has the N boxes of a frame and the masks that belong to them."""
 
-    frame_id: str  # its name
+    frame_id: str  # name of the frame
     boxes: CarBoxes  # of N cars, locations in the frame `ref` of the camera
-    # For each side the box (N, 4) around the mask of each car, pixels, NaN where it has none.
+    # For each side the box (N, 4) around the mask of each car, pixels, NaN without a mask.
     mask_boxes: dict[Side, Floats]
-    # For each side the overlap (N,) of that box with what it was matched by, 0 where it has none.
+    # For each side the IoU (N,) of that box with the box of its match, 0 without a mask.
     overlap: dict[Side, Floats]
-    num_masks: dict[Side, int]  # for each side the masks of cars, whether they belong to a box or not
-    seen: tuple[Floats, ...]  # for each car what of the left masks may be its own, (., 4) boxes
-    masks: tuple[NDArray[np.bool_] | None, ...]  # the left mask (H, W) of each car, bool, or None
-    camera: StereoCamera  # of the frame
-    size_hw: tuple[int, int]  # of its images
+    num_masks: dict[Side, int]  # for each side the number of car masks, with or without a box
+    seen: tuple[Floats, ...]  # for each car the (., 4) boxes of left masks that may be its own
+    masks: tuple[NDArray[np.bool_] | None, ...]  # the left mask (H, W) of each car, or None
+    camera: StereoCamera  # camera of the frame
+    size_hw: tuple[int, int]  # size of its images
     has_masks: bool  # whether the frame's masks could be read
-    words: Words  # of its source
-    pair: Pair | None = None  # its images, where distances can be measured by them
-    # Boxes (M, 4) around the left masks of cars by the way in which they may have to be read, see `reread_boxes`.
+    words: Words  # wording for its source of data
+    pair: Pair | None = None  # its images, if distances can be measured with them
+    # Boxes (M, 4) around the left masks of cars by the order of pixels in which they are read, see `reread_boxes`.
     reread: dict[str, Floats] = field(default_factory=dict)
-    scan: Scan | None = None  # of its LiDAR, where there is one
+    scan: Scan | None = None  # LiDAR scan, if there is one
 
 
 def evidence_of_scene(frames: FrameBatch, detections: Detections, words: Words | None = None) -> list[FrameEvidence]:
-    """The evidence of every frame; cars with numbers that are not finite, or without 2D box and mask, are left out.
+    """The evidence of every frame, without cars that have non-finite numbers or neither 2D box nor mask.
 
-    Its words are those of the tensors, unless others are given.
+    The wording is for tensors, unless `words` is given.
     """
     words = words or words_of_tensors(detections.convention)
     usable = (_array(detections.T_cam_obj).reshape(-1, 16), _array(detections.dimensions_hwl))
@@ -98,10 +98,10 @@ def evidence_of_scene(frames: FrameBatch, detections: Detections, words: Words |
 
 
 def reread_boxes(masks: Iterable[NDArray[np.bool_]]) -> dict[str, Floats]:
-    """Boxes around masks (H, W) whose file was written in another order of pixels than it was read in.
+    """Boxes around masks (H, W) after their pixels are read in other orders than that of the file.
 
-    Run lengths go down the columns; read so, those that went along the rows are scattered over the whole image. Masks
-    without a pixel, as those of NaN, have no box.
+    Run lengths go down the columns. If a file has them along the rows, the mask that is read is scattered over the
+    whole image. Masks without a pixel, such as masks of NaN, have no box.
     """
     whole = [mask for mask in masks if mask.any()]
     row_by_row = [_box_around(mask.T.reshape(mask.shape)) for mask in whole]
@@ -111,7 +111,7 @@ def reread_boxes(masks: Iterable[NDArray[np.bool_]]) -> dict[str, Floats]:
 
 
 def _box_around(mask: NDArray[np.bool_]) -> Floats:
-    """u_min, v_min, u_max, v_max of the middle 98 % of the pixels: a run that is cut by an edge lies elsewhere."""
+    """u_min, v_min, u_max, v_max of the middle 98 % of the pixels, without parts of runs that were cut by an edge."""
     v, u = np.nonzero(mask)
     low, high = (np.percentile([u, v], part, axis=1) for part in (1, 99))
     return np.asarray(np.concatenate([low, high]))
@@ -160,7 +160,7 @@ def _frame_evidence(
 
 
 def _scan(points_cam: Floats) -> Scan:
-    """Points (P, 3) of the left camera as those of a LiDAR that stands there."""
+    """Points (P, 3) of the left camera as the scan of a LiDAR at the same place."""
     points_cam = points_cam[np.isfinite(points_cam).all(axis=1)]
     return Scan({4: points_cam @ T_CAMERA_LIDAR[:3, :3]}, T_CAMERA_LIDAR)
 
@@ -172,7 +172,7 @@ def _pair(frames: FrameBatch, number: int, size_hw: tuple[int, int]) -> Pair:
 
 
 def _camera_of(camera: StereoCamera, number: int) -> StereoCamera:
-    """Of one frame, in float64 on the host, with boxes in the left camera's own frame."""
+    """The camera of one frame, in float64 on the CPU, with boxes in the left camera's own frame."""
     parts = {name: getattr(camera, name)[number : number + 1] for name in ("K_left", "K_right", "T_right_cam")}
     one = replace(camera, **parts, t_cam_ref=torch.zeros_like(camera.t_cam_ref[:1]))
     return one.to("cpu", torch.float64)

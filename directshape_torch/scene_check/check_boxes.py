@@ -1,4 +1,4 @@
-"""Whether boxes are written as their convention says: axes, origin, heading, order of lengths, units; corners in 2D."""
+"""This module checks whether boxes follow their convention: axes, origin, heading, order, units; corners in 2D."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from directshape_torch.scene_check.conventions import (
 from directshape_torch.scene_check.finding import Finding, found, of_cars
 from directshape_torch.scene_check.words import Words
 
-# Mean overlap that another convention must gain for boxes to be taken as written in it: with the observation angles,
-# and without them for many and for few cars. Intact sets gain nothing, single frames of two to six cars up to 0.05.
+# Another convention must gain this mean IoU before boxes are taken to be written in it: with observation angles, and
+# without them for many and for few cars. Correct data sets gain nothing, single frames of two to six cars up to 0.05.
 MIN_GAIN, MIN_GAIN_IMAGE, MIN_GAIN_OF_FEW = 0.08, 0.06, 0.12
 MANY_CARS = 8
-# Of 2D boxes read as corner and size.
+# 2D boxes must gain this when they are read as corner and size.
 MIN_GAIN_2D = 0.15
 TIE = 0.04
 MIN_OVERLAP = 0.45
@@ -31,7 +31,7 @@ MIN_CARS_FOR_SHAPE = 4
 MAX_HEIGHT_TO_WIDTH = 1.03
 _ONE_TURN = 2 * np.pi + 0.01
 
-# Parts of a convention that are a factor: the check that names it, what it multiplies, what is expected, the cure.
+# These are the parts of a convention that are factors: the check, the multiplied quantity, the expectation, the cure.
 _FACTORS = {
     "focal": (
         "focal_length",
@@ -46,7 +46,7 @@ _FACTORS = {
 
 
 def check_boxes(frames: Sequence[FrameEvidence]) -> list[Finding]:
-    """What the boxes of all frames show together; nothing where there are no cars."""
+    """What the boxes of all frames show together; the result is empty without cars."""
     frames = [frame for frame in frames if len(frame.boxes)]
     if not frames:
         return []
@@ -67,11 +67,11 @@ def check_boxes(frames: Sequence[FrameEvidence]) -> list[Finding]:
 
 
 def _better_convention(scores: ConventionScores) -> int | None:
-    """The convention that explains image and observation angles so much better that it must be the one in use."""
+    """The convention that explains image and angles clearly better than the documented one, or None."""
     image_gain = MIN_GAIN_IMAGE if scores.overlap.shape[1] >= MANY_CARS else MIN_GAIN_OF_FEW
     by_angles = [] if scores.angle_share is None else [(scores.score_with_angles, MIN_GAIN)]
     for score, gain in (*by_angles, (scores.score, image_gain)):
-        # Of those that explain about the same the simplest.
+        # Among conventions that explain about the same, the simplest is taken.
         close = np.flatnonzero(score > score.max() - TIE)
         best = int(min(close, key=lambda row: (len(scores.conventions[row].deviations), -score[row])))
         explains = scores.overlap[best].mean() > MIN_OVERLAP
@@ -162,7 +162,7 @@ def check_box_2d(frames: Sequence[FrameEvidence]) -> list[Finding]:
 
 
 def check_corners(frames: Sequence[FrameEvidence]) -> list[Finding]:
-    """Whether 2D boxes end after they begin; those that are no box at all are looked at with the files."""
+    """Whether 2D boxes end after they begin; missing 2D boxes are checked with the files."""
     boxes = np.concatenate([np.empty((0, 4)), *(frame.boxes.box_2d for frame in frames)])
     boxes = boxes[(boxes != 0).any(axis=1)]
     empty = int((boxes[:, 2:] <= boxes[:, :2]).any(axis=1).sum())

@@ -1,4 +1,4 @@
-"""Calibration and images by themselves: signs and magnitudes; swapped, mirrored, of other scenes, not rectified."""
+"""This module checks calibration and images: signs, magnitudes, swapped, mirrored, unrelated or unrectified images."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from directshape_torch.scene_check.check_places import swapped
 from directshape_torch.scene_check.finding import Finding, Severity, found
 from directshape_torch.scene_check.words import Words
 
-# With these wrong, what disparities and projections show says nothing more.
+# If one of these is wrong, disparities and projections are not informative.
 SPOILS_CAMERA = frozenset({"raw_intrinsics", "baseline_sign", "baseline_length", "focal_length", "principal_point"})
 SPOILS_PAIR = frozenset(
     {
@@ -29,31 +29,31 @@ SPOILS_PAIR = frozenset(
         "raw_intrinsics",
     }
 )
-# Lenses from 15 to 150 degrees of view across the image.
+# This is the range of lenses with 15 to 150 degrees of view across the image.
 FOCAL_SHARES = (0.13, 3.8)
-# Crops move the centre; a half of the image is no crop any more.
+# Crops move the centre. An offset of half the image is not a crop.
 CENTRE_SHARE_WARNING = 0.15
 BASELINES_M = (0.03, 3.0)
-# The squares of pixels: rectified images have them unless resized in one direction.
+# Rectified images have square pixels unless they were resized in one direction.
 ASPECT_TOLERANCE = 0.05
-# By how much focal lengths (a share) and rows of the centre (pixels) of a rectified pair differ at most: by rounding.
+# In a rectified pair, focal lengths (a share) and rows of the centre (pixels) differ at most by rounding.
 _FOCAL_TOLERANCE, _ROW_TOLERANCE_PX = 0.002, 0.5
-# Images that were resized move both coordinates of the centre by the same factor, which is none near 1.
+# Resizing scales both coordinates of the centre by the same factor, which differs clearly from 1.
 _SAME_FACTOR, _LEAST_FACTOR = 0.1, 1.3
 MIN_MATCHES = 30
-# Images with so many features that still do not match are not of one scene.
+# Images with this many features that still do not match show different scenes.
 MANY_FEATURES = 500
-# With fewer, it is asked whether one of the images is mirrored.
+# With fewer matches it is checked whether one of the images is mirrored.
 FEW_MATCHES = 200
-# Two photographs of different places agree on fewer, by chance.
+# Photographs of different places have a smaller share of inliers by chance.
 MIN_INLIER_SHARE = 0.4
 SAME_IMAGE_PX = 0.05
-# Share of points that lie at a negative disparity by more than a pixel.
+# This is a share of points with a disparity below -1 pixel.
 MAX_NEGATIVE_SHARE = 0.2
 VERTICAL_WARNING_PX, VERTICAL_ERROR_PX = 0.75, 1.5
 SCATTER_WARNING_PX = 1.0
 NUM_FEATURES = 3000
-# Lowe's ratio test.
+# This is the threshold of Lowe's ratio test.
 BEST_TO_SECOND = 0.75
 EPIPOLAR_TOLERANCE_PX = 1.0
 CONFIDENCE = 0.999
@@ -66,8 +66,10 @@ def check_calibration(
     where: str,
     words: Words,
 ) -> list[Finding]:
-    """Everything that the numbers alone show: intrinsics (3, 3) by camera, baseline (NaN: a focal length is nothing)
-    and size of the images, where it is known."""
+    """Findings from numbers alone: intrinsics (3, 3) by camera, baseline and image size.
+
+    The baseline is NaN if a focal length is 0, and the size may be unknown.
+    """
     findings = []
     if size_hw is not None:
         findings = [f for name, K in cameras.items() for f in _check_intrinsics(K, size_hw, f"{where}, {name}")]
@@ -76,7 +78,7 @@ def check_calibration(
         measured = f"baseline {baseline_m:.4f} m: the right camera is not to the right of the left one"
         return [*findings, found("baseline_sign", where, measured, words=words)]
     low, high = BASELINES_M
-    if baseline_m < low or baseline_m > high:  # neither of NaN
+    if baseline_m < low or baseline_m > high:  # false for NaN
         measured = f"baseline {baseline_m:.4g} m"
         findings.append(found("baseline_length", where, measured, words=words, low=low, high=high))
     return findings
@@ -99,7 +101,7 @@ def _check_intrinsics(K: NDArray[np.float64], size_hw: tuple[int, int], where: s
 
 
 def _check_alike(cameras: Mapping[str, NDArray[np.float64]], where: str) -> list[Finding]:
-    """Whether both images can have been rectified to these intrinsics; a warning, for images may be cut differently."""
+    """Whether both images can be rectified to these intrinsics; a warning if they may be cropped differently."""
     left, right = cameras.values()
     scale = max(abs(right[k, k] / left[k, k] - 1) for k in (0, 1))
     if not (scale > _FOCAL_TOLERANCE or abs(right[1, 2] - left[1, 2]) > _ROW_TOLERANCE_PX):
@@ -111,7 +113,7 @@ def _check_alike(cameras: Mapping[str, NDArray[np.float64]], where: str) -> list
 
 
 def without_doubts(of_numbers: Sequence[Finding], of_pair: Sequence[Finding]) -> list[Finding]:
-    """What numbers show, but doubts about intrinsics that matches have settled."""
+    """Findings from numbers without doubts about intrinsics that matches have settled."""
     settled = not any(finding.check == "few_matches" for finding in of_pair)
     return [
         finding
@@ -136,7 +138,7 @@ def _check_centre(centre: tuple[float, float], size_wh: tuple[int, int], where: 
 def check_images(
     left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera | None, where: str
 ) -> list[Finding]:
-    """What feature matches of two images (H, W, 3) show; the camera, where it is known, says where they should be."""
+    """Findings from feature matches of two images (H, W, 3); a known camera gives their expected positions."""
     matches = match_pair(left, right)
     if len(matches) < FEW_MATCHES:
         mirrored = match_pair(left, np.ascontiguousarray(right[:, ::-1]))
@@ -149,7 +151,7 @@ def check_images(
 def check_pair(
     matches: PairMatches, camera: StereoCamera | None, size_hw: tuple[int, int], where: str
 ) -> list[Finding]:
-    """What the feature matches of a pair show; without a camera equal rows are expected."""
+    """Findings from the feature matches of a pair; without a camera equal rows are expected."""
     if matches.num_candidates < MIN_MATCHES and matches.num_features < MANY_FEATURES:
         measured = f"{matches.num_candidates} feature matches between the images"
         return [found("few_matches", where, measured, limit=MIN_MATCHES)]
@@ -167,7 +169,7 @@ def check_pair(
 def _check_geometry(
     matches: PairMatches, camera: StereoCamera | None, size_hw: tuple[int, int], where: str
 ) -> list[Finding]:
-    """Whether points lie where a calibration lets them; without one in equal rows, and farther left on the right."""
+    """Whether points fit a calibration; without one they must have equal rows and be farther left on the right."""
     disparity, rows = _residuals(matches, camera)
     negative = float(np.mean(disparity < -1.0))
     sides = [swapped(where, disparity)] if negative > MAX_NEGATIVE_SHARE else []
@@ -175,7 +177,7 @@ def _check_geometry(
 
 
 def _raw(matches: PairMatches, camera: StereoCamera, where: str) -> Finding:
-    """That matches speak against the calibration, and not against that of an ideal rectified pair."""
+    """A finding that matches fit an ideal rectified pair but not the calibration."""
     (disparity, rows), (_, equal) = _residuals(matches, camera), _residuals(matches, None)
     measured = (
         f"{len(matches)} matched points have the same rows in both images within {np.median(np.abs(equal)):.2f} px; by "
@@ -186,16 +188,18 @@ def _raw(matches: PairMatches, camera: StereoCamera, where: str) -> Finding:
 
 
 def _residuals(matches: PairMatches, camera: StereoCamera | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Disparities (N,) as they were with equal intrinsics, and `v_right - v_left` (N,) beyond what the calibration
-    explains, pixels of the right image."""
+    """Disparities (N,) for equal intrinsics, and `v_right - v_left` (N,) beyond what the calibration explains.
+
+    Both are in pixels of the right image.
+    """
     if camera is None:
         return np.asarray(matches.uv_left[:, 0] - matches.uv_right[:, 0]), matches.vertical
     K_left, K_right, t = camera.K_left[0].numpy(), camera.K_right[0].numpy(), camera.T_right_cam[0, :3, 3].numpy()
     scale = K_right.diagonal()[:2] / K_left.diagonal()[:2]
-    # Where the right camera would see what the left one sees, were it far away.
+    # These are the right camera's pixels for points of the left image at infinity.
     far = (matches.uv_left - K_left[:2, 2]) * scale + K_right[:2, 2]
     disparity = far[:, 0] - matches.uv_right[:, 0]
-    # t_y / z with z = fx b / disparity.
+    # This is t_y / z with z = fx b / disparity.
     lower = disparity * (K_right[1, 1] / K_right[0, 0]) * (t[1] / -t[0])
     return np.asarray(disparity), np.asarray(matches.uv_right[:, 1] - far[:, 1] - lower)
 
@@ -223,9 +227,9 @@ def _fit_rows(
     residual: NDArray[np.float64],  # (N,)
     size_hw: tuple[int, int],
 ) -> tuple[float, float, float, float]:
-    """Median of the row residual, its change over the width and over the height of the image, and what is left.
+    """Median of the row residual, its change over the width and over the height of the image, and the scatter.
 
-    The slopes are fitted by least squares with points beyond three deviations left out, five times.
+    The slopes are fitted by least squares, five times, each time without points beyond three deviations.
     """
     height, width = size_hw
     basis = np.column_stack([np.ones(len(residual)), uv_left[:, 0] / width - 0.5, uv_left[:, 1] / height - 0.5])
@@ -240,24 +244,24 @@ def _fit_rows(
 
 @dataclass(frozen=True)
 class PairMatches:
-    """Points that show the same thing in both images."""
+    """A `PairMatches` has points that show the same place in both images."""
 
     uv_left: NDArray[np.float64]  # (N, 2) pixels
     uv_right: NDArray[np.float64]
-    num_candidates: int  # matches before those were dropped that obey no common epipolar geometry
-    num_features: int = 0  # of the image that has fewer of them
+    num_candidates: int  # matches before those without a common epipolar geometry were dropped
+    num_features: int = 0  # of the image with fewer features
 
     def __len__(self) -> int:
         return len(self.uv_left)
 
     @property
     def vertical(self) -> NDArray[np.float64]:
-        """(N,) v_right - v_left, pixels."""
+        """Row differences (N,) v_right - v_left, pixels."""
         return np.asarray(self.uv_right[:, 1] - self.uv_left[:, 1])
 
 
 def match_pair(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> PairMatches:
-    """SIFT features of two images (H, W, 3) matched both ways, then a fundamental matrix by RANSAC (of fixed seed)."""
+    """SIFT features of two images (H, W, 3) matched both ways, filtered by a fundamental matrix (seeded RANSAC)."""
     import cv2
 
     sift = cv2.SIFT_create(NUM_FEATURES)  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""Whether LiDAR points lie where the images show something, and if not, which other way to read them fits."""
+"""This module checks whether LiDAR points fit the images, and if not, which other way to read them fits."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from directshape_torch.scene_check.car_evidence import T_CAMERA_LIDAR, Floats, F
 from directshape_torch.scene_check.finding import Finding, Severity, found
 from directshape_torch.stereo_matching.disparity import match_disparity
 
-# Share of the points above the road whose disparity is that of the images. Right scans reach 0.73 and more, those of
-# other frames, axes and columns 0.44 at most.
+# This is the share of the points above the road with the disparity of the images. Correct scans reach 0.73 or more,
+# scans of other frames, axes and columns at most 0.44.
 AGREEMENT_ERROR, AGREEMENT_WARNING = 0.5, 0.6
-# What another way to read a scan must gain.
+# Another way to read a scan must gain this.
 _MIN_GAIN = 0.2
-# Ways with so much fewer points that agree count as equals.
+# Ways whose numbers of agreeing points differ by less than this share count as equal.
 _TIE = 0.05
-# Both in pixels and as a share: the error of a rig's disparity and that of the matching.
+# The tolerance, in pixels and as a share, covers the errors of the rig's disparity and of the matching.
 _TOLERANCE_PX, _TOLERANCE_SHARE = 2.0, 0.05
-# Roads look alike in all frames, so points that far below the camera say little.
+# Roads look alike in all frames, so points this far below the camera say little.
 _ROAD_BELOW_M = 1.2
 _NEAREST_M = 1.0
 _FEWEST_POINTS = 100
@@ -43,7 +43,7 @@ _UNITS = {_AS_DOCUMENTED: 1.0, "millimetres": 0.001, "centimetres": 0.01}
 
 
 class _Way(NamedTuple):
-    """One way to read a scan."""
+    """A `_Way` is one way to read a scan."""
 
     columns: int
     axes: str
@@ -51,19 +51,19 @@ class _Way(NamedTuple):
     place: str
 
     def is_possible(self, scan: Scan) -> bool:
-        """Whether the file could have such columns, and points of tensors have no calibration that could be wrong."""
+        """Whether the file could have such columns; points of tensors have no calibration that could be wrong."""
         is_tensor = scan.T_cam_lidar is T_CAMERA_LIDAR
         return self.columns in scan.points and (self.place == _AS_DOCUMENTED or not is_tensor)
 
     def words(self, scan: Scan) -> list[str]:
-        """Where it differs from the documented way."""
+        """The deviations from the documented way, as text."""
         of_columns = [] if self.columns == scan.columns else [f"as {self.columns} numbers a point"]
         parts = {"with the axes": self.axes, "in": self.unit, "with the calibration": self.place}
         return of_columns + [f"{part} {value}" for part, value in parts.items() if value != _AS_DOCUMENTED]
 
 
 def check_lidar(frames: Sequence[FrameEvidence]) -> list[Finding]:
-    """What the scans of all frames show against their images, of those that have both."""
+    """Findings from all frames that have both a scan and images."""
     judges = {
         one.frame_id: _Judge(one.scan, one.pair, one.camera)
         for one in frames
@@ -90,9 +90,10 @@ def _finding(severity: Severity, where: str, share: float, fits: str, cure: str)
 
 
 def _better_way(judges: Sequence[_Judge], mean: float) -> tuple[str, str] | None:
-    """Words for the way to read the scans that fits clearly better, the simplest of equals, and its cure.
+    """Words and cure for the way to read the scans that fits clearly better, or None; ties go to the simplest.
 
-    The way with most points that agree is taken: wrong columns leave a part of the points whole, which agree as well.
+    The way with most agreeing points is taken, because wrong columns keep a part of the points correct, which agree as
+    well.
     """
     ways = [way for way in _ways() if all(way.is_possible(judge.scan) for judge in judges)]
     counts = np.array([np.mean([judge.count(way) for judge in judges]) for way in ways])
@@ -135,9 +136,9 @@ _PLACES: dict[str, Callable[[Floats], Floats]] = {
 
 
 def _points(scan: Scan, way: _Way) -> Floats:
-    """The points (P, 3) of a scan in the left camera, read in some way; those that are not finite left out."""
+    """The finite points (P, 3) of a scan in the left camera, read in the given way."""
     points = scan.points[way.columns]
-    # By chance: every n-th point of wrong columns may be whole.
+    # The choice is random, since every n-th point of wrong columns may be correct.
     points = points[np.random.default_rng(0).choice(len(points), min(len(points), _MOST_POINTS), replace=False)]
     points = points[np.isfinite(points).all(axis=1)]
     signed = _AXES[way.axes]
@@ -148,7 +149,7 @@ def _points(scan: Scan, way: _Way) -> Floats:
 
 
 class _Judge:
-    """The scan and both images of a frame, and how well they agree."""
+    """A `_Judge` compares the scan of a frame with its images."""
 
     def __init__(self, scan: Scan, pair: Pair, camera: StereoCamera) -> None:
         self.scan = scan
@@ -157,16 +158,16 @@ class _Judge:
         self.disparity = match_disparity(*pair)
         self.can_tell = int(np.isfinite(self.disparity).sum()) >= _MOST_POINTS
         documented = _as_documented(scan)
-        # Of wrong columns some points are whole, and most of the others fall out of the image.
+        # With wrong columns some points are correct, and most of the others are outside the image.
         self._fewest = max(self.count(documented._replace(columns=columns)) for columns in scan.points)
 
     def share(self, way: _Way) -> float:
-        """Share of the points above the road whose disparity is that of the images, where that is known."""
+        """Share of the points above the road, with known disparity in the image, that agree with it."""
         agree = self._agree(way)
         return float(agree.sum()) / max(len(agree), self._fewest, _FEWEST_POINTS)
 
     def count(self, way: _Way) -> float:
-        """How many of the points that are read agree."""
+        """Number of the points that agree."""
         return float(self._agree(way).sum())
 
     def _agree(self, way: _Way) -> Floats:

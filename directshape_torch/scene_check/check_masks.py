@@ -1,4 +1,4 @@
-"""Masks against boxes: another frame's, mirrored, shifted, in another order, the sides swapped, none at all."""
+"""This module checks masks against boxes: of another frame, mirrored, shifted, in another order, swapped, absent."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence
 from directshape_torch.scene_check.conventions import projected_boxes
 from directshape_torch.scene_check.finding import Finding, Severity, found, of_cars
 
-# Mean overlap of masks and 2D boxes, over as many pairs as there could be.
+# This is the mean IoU of masks and 2D boxes, over the possible number of pairs.
 OVERLAP_ERROR, OVERLAP_WARNING = 0.3, 0.37
-# Those of the right images lie farther left by the disparity.
+# Masks of the right images are shifted left by the disparity.
 OVERLAP_RIGHT = 0.15
 # A detector may well miss all of three cars.
 MIN_PAIRS = 4
-# How much better the right masks must fit the left boxes.
+# The right masks must fit the left boxes better by this.
 MIN_SWAP_GAIN = 0.1
-# Mean overlap with projected 3D boxes that masks must have, and gain, for a way in which they are wrong to be believed.
+# For a mistake to be reported, corrected masks must have and gain this mean IoU with projected 3D boxes.
 MOVED_OVERLAP, MOVED_GAIN = 0.5, 0.2
 _ORDER_OF_PIXELS = (
     "write run lengths down the columns (np.asfortranarray(mask)), polygons as x0, y0, x1, y1, .., and arrays as (H, W)"
@@ -28,7 +28,7 @@ _ORDER_OF_PIXELS = (
 
 
 def check_masks(frames: Sequence[FrameEvidence]) -> list[Finding]:
-    """What masks and 2D boxes of all frames show together; masks of the left images alone are enough."""
+    """What masks and 2D boxes of all frames show together; masks of the left images are enough."""
     frames = [frame for frame in frames if frame.has_masks and len(frame.boxes)]
     if not frames:
         return []
@@ -53,14 +53,14 @@ def check_masks(frames: Sequence[FrameEvidence]) -> list[Finding]:
     if sum(_pairs(frame, "right") for frame in frames) >= MIN_PAIRS and right < OVERLAP_RIGHT:
         measured = f"right masks and 2D boxes of cars overlap by {right:.2f} in the mean, left ones by {left:.2f}"
         return [found("masks_elsewhere", "all frames", measured, severity="warning", limit=OVERLAP_RIGHT)]
-    # Single frames whose masks are those of another, among others that are right.
+    # Single frames may have masks of another frame although the others are right.
     overlaps = {frame.frame_id: _mean_overlap([frame], "left") for frame in frames if _pairs(frame) > 1}
     wrong = {frame_id: overlap for frame_id, overlap in overlaps.items() if overlap < OVERLAP_ERROR}
     return [_mismatch("warning", f"frame {frame_id}", overlap) for frame_id, overlap in wrong.items()]
 
 
 def _reread(frames: Sequence[FrameEvidence], left: float) -> Finding | None:
-    """That left masks fit once their pixels are read in another order; `left` is their overlap as they are."""
+    """A finding that left masks fit if their pixels are read in another order; `left` is their IoU as given."""
     ways = _read_otherwise(frames)
     way = max(ways, key=ways.__getitem__, default="")
     if not way or ways[way] < MOVED_OVERLAP or ways[way] < left + MOVED_GAIN:
@@ -70,7 +70,7 @@ def _reread(frames: Sequence[FrameEvidence], left: float) -> Finding | None:
 
 
 def _read_otherwise(frames: Sequence[FrameEvidence]) -> dict[str, float]:
-    """Mean overlap of projected 3D boxes and masks, one to one, by the way in which the masks are read."""
+    """Mean IoU of projected 3D boxes and masks, one to one, by the order in which the masks are read."""
     overlaps = {
         way: np.concatenate([_reassigned(projected_boxes(frame), frame.reread[way]) for frame in frames])
         for way in frames[0].reread
@@ -79,11 +79,11 @@ def _read_otherwise(frames: Sequence[FrameEvidence]) -> dict[str, float]:
 
 
 def check_placement(frames: Sequence[FrameEvidence], explained: float) -> list[Finding]:
-    """Whether masks fit the 3D boxes once they are mirrored, shifted, given to other cars or read in another order.
+    """Whether masks fit the 3D boxes once they are mirrored, shifted, reassigned or read in another order.
 
     Args:
-        frames: of all frames.
-        explained: the mean overlap that another way to read the boxes reaches, which must be beaten.
+        frames: evidence of all frames.
+        explained: the mean IoU of another way to read the boxes, which must be exceeded.
     """
     pairs = [_pairs_of(frame) for frame in frames]
     boxes, masks = (np.concatenate([pair[k] for pair in pairs]).reshape(-1, 4) for k in (0, 1))
@@ -114,7 +114,7 @@ def check_placement(frames: Sequence[FrameEvidence], explained: float) -> list[F
 
 
 def _pairs_of(frame: FrameEvidence) -> tuple[Floats, Floats]:
-    """Boxes around the projected 3D box and the own left mask of each car that has one."""
+    """Boxes around the projected 3D box and around the left mask, for each car that has one."""
     masks = frame.mask_boxes["left"]
     has = np.isfinite(masks).all(axis=1)
     return projected_boxes(frame)[has], masks[has]
@@ -136,7 +136,7 @@ def _reassigned(boxes: Floats, masks: Floats) -> Floats:
 
 
 def _are_crossed(frames: Sequence[FrameEvidence]) -> bool:
-    """Whether masks of the right images lie farther right than those of the left ones, which no rig can see."""
+    """Whether masks are farther right in the right images than in the left ones, which is impossible."""
     both = [frame.mask_boxes["left"][:, 0::2].mean(1) - frame.mask_boxes["right"][:, 0::2].mean(1) for frame in frames]
     disparity = np.concatenate(both)
     disparity = disparity[np.isfinite(disparity)]
@@ -144,7 +144,7 @@ def _are_crossed(frames: Sequence[FrameEvidence]) -> bool:
 
 
 def _mean_overlap(frames: Sequence[FrameEvidence], side: Side) -> float:
-    """Over all pairs that the frames could have made: as many as there are masks or boxes, whichever are fewer."""
+    """Mean IoU over the possible pairs, whose number is that of masks or of boxes, whichever is smaller."""
     overlap = float(sum(np.nan_to_num(frame.overlap[side]).sum() for frame in frames))
     return overlap / max(1, sum(_pairs(frame, side) for frame in frames))
 

@@ -1,4 +1,4 @@
-"""Whether cars stand and head where their boxes say: distances by disparity, headings by the mean car's outline."""
+"""This module checks distances of cars by disparity, and headings by the mean car's outline."""
 
 from __future__ import annotations
 
@@ -19,32 +19,33 @@ from directshape_torch.scene_check.words import Words
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.zero_level import sdf_to_mesh
 
-# The visible surface lies before the centre by about a third of the box's depth.
+# The visible surface is in front of the centre by about this share of the box's depth.
 _SURFACE_SHARE = 0.33
 _MIN_HEIGHT_PX = 25
-# Cars are matched at this height: fine enough for the distance, and quick.
+# Cars are matched at this height, which is fine enough for the distance, and fast.
 _PATCH_HEIGHT_PX = 48
-# Share of the image's width that disparities may have; nearer cars are not seen by both cameras.
+# This is the largest disparity as a share of the image's width; nearer cars are not visible in both images.
 _LARGEST_DISPARITY = 0.3
 _MIN_CORRELATION = 0.6
 _FEWEST_SWAPPED = 3
 WARNING_RATIO, ERROR_RATIO = 1.15, 1.3
-# The mean of a few boxes of a monocular detector may be off by more.
+# The mean of a few boxes of a monocular detector may have a larger error.
 FEW_CARS, WARNING_RATIO_OF_FEW = 8, 1.25
-# Outlines are compared at this size, box on box, so that where the car stands does not count.
+# Outlines are compared at this size, scaled to the box, so that the position of the car does not matter.
 _SIZE_PX = 64
 _NEAREST_M = 3.0
-# Of the mask's box and that of the 3D box: less is cut off, hidden, or wrong in other ways.
+# A smaller IoU of the mask's box and the 3D box means that the car is cut off, hidden, or wrong in other ways.
 _MIN_OVERLAP = 0.4
-# |cos| of the angle between the car's axis and the line of sight's normal: from ahead and behind cars look alike.
+# |cos| of the angle between the car's axis and the normal of the line of sight must exceed this, because cars seen from
+# the front and from behind look alike.
 _MIN_SIDE_VIEW = 0.35
 _FEWEST_CARS = 3
-# Gain in agreement, and its standard errors, that make another heading the true one.
+# Another heading is accepted with this gain in agreement, also in standard errors.
 _LEAST_GAIN, _SURE = 0.035, 2.5
-# What the best of eight headings gains for each car by itself, where headings say nothing; 0.03 where they are right.
+# The best of eight headings for each car gains more than this if headings are meaningless, and 0.03 if they are right.
 _LEAST_FREE_GAIN, _FEWEST_FREE = 0.12, 8
 _HEADINGS = np.arange(8) * np.pi / 4
-# Other headings in KITTI's sense, by that and the one of a car that drives to the right, and the cure.
+# These are other headings as functions of KITTI's heading and of that of a car that drives to the right, with cures.
 _WAYS: dict[str, tuple[Callable[[float, float], float], str]] = {
     "turned by 180 degrees": (lambda yaw, _: yaw + np.pi, "add pi to the headings"),
     "with the opposite sign": (lambda yaw, right: 2 * right - yaw, "negate the headings"),
@@ -52,11 +53,11 @@ _WAYS: dict[str, tuple[Callable[[float, float], float], str]] = {
 
 
 def measure_cars(frame: FrameEvidence, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> Floats:
-    """What both images (H, W, 3) say of the cars that have a tall enough left mask and are in front of the camera.
+    """Measurements of both images (H, W, 3) for cars in front of the camera with a tall enough left mask.
 
     Returns:
-        (N, 3) disparity in pixels as it were with equal principal points, and over the distance of the box that by
-        disparity and that by the height of the mask, which needs no baseline.
+        (N, 3) disparity in pixels for equal principal points, and two distances divided by the distance of the box: by
+        disparity, and by the height of the mask, which needs no baseline.
     """
     around, camera = frame.mask_boxes["left"], frame.camera
     shift = float(camera.K_left[0, 0, 2] - camera.K_right[0, 0, 2])
@@ -71,9 +72,10 @@ def measure_cars(frame: FrameEvidence, left: NDArray[np.uint8], right: NDArray[n
 
 
 def patch_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], box: Floats) -> float:
-    """By how many pixels what a box shows in the left image lies farther left in the right one; NaN if nowhere.
+    """Shift in pixels, left to right image, of the content of a box, positive to the left; NaN if there is no match.
 
-    The best normalised correlation along the rows, in both directions: swapped images have negative disparities.
+    It is the best normalised correlation along the rows, in both directions, since swapped images have negative
+    disparities.
     """
     import cv2
 
@@ -111,7 +113,7 @@ def _ratios(frame: FrameEvidence, car: int, disparity: float) -> tuple[float, fl
 
 
 def _surface_depth(frame: FrameEvidence, car: int) -> float:
-    """Depth of the middle of the visible surface, metres."""
+    """Depth of the centre of the visible surface, metres."""
     _, width, length = frame.boxes.hwl[car]
     yaw = frame.boxes.rotation_y[car]
     extent = abs(length * np.sin(yaw)) + abs(width * np.cos(yaw))
@@ -120,7 +122,7 @@ def _surface_depth(frame: FrameEvidence, car: int) -> float:
 
 
 def check_swapped(cars: Floats) -> list[Finding]:
-    """Whether cars, as `measure_cars` has them, lie farther right in the right image."""
+    """Whether cars, measured by `measure_cars`, are farther right in the right image."""
     disparity = cars[:, 0]
     if len(disparity) < _FEWEST_SWAPPED or np.mean(disparity < -1.0) < 0.7:
         return []
@@ -128,7 +130,7 @@ def check_swapped(cars: Floats) -> list[Finding]:
 
 
 def swapped(where: str, disparity: Floats) -> Finding:
-    """That many of some disparities (N,) are negative, by more than a pixel."""
+    """A finding that many disparities (N,) are below -1 pixel."""
     negative, median = np.mean(disparity < -1.0), np.median(disparity)
     measured = (
         f"{negative:.0%} of what matches lies farther right in the right image (median disparity {median:.1f} px)"
@@ -137,7 +139,7 @@ def swapped(where: str, disparity: Floats) -> Finding:
 
 
 def check_distances(cars: Floats) -> list[Finding]:
-    """Whether boxes stand where the disparity says, over the cars of all frames, as `measure_cars` has them."""
+    """Whether boxes have the distances of the disparity, over the cars of all frames, measured by `measure_cars`."""
     ratios = cars[np.isfinite(cars[:, 1:]).all(axis=1), 1:]
     if not len(ratios):
         return []
@@ -195,7 +197,7 @@ def _finding(num_cars: int, measured: str, cure: str, words: Words) -> Finding:
 
 
 def _gains(frame: FrameEvidence) -> list[list[float]]:
-    """For each car what each way gains in agreement, what the best heading gains, and how much of its side is seen."""
+    """For each car the gain in agreement of each way and of the best heading, and the visible share of its side."""
     projected = projected_boxes(frame)
     height, width = frame.size_hw
     gains, right = [], frame.words.form.heading_of_right
@@ -218,7 +220,7 @@ def _gains(frame: FrameEvidence) -> list[list[float]]:
 
 
 def _agreement(frame: FrameEvidence, car: int, yaw: float, seen: NDArray[np.bool_], aspect: float) -> float:
-    """Overlap of the outline with the mask, box on box, times the ratio of their aspects."""
+    """IoU of the outline with the mask, both scaled to their boxes, times the ratio of their aspects."""
     outline, own_aspect = _outline(frame, car, yaw)
     overlap = float((seen & outline).sum() / (seen | outline).sum())
     return overlap * min(own_aspect / aspect, aspect / own_aspect)
@@ -226,7 +228,7 @@ def _agreement(frame: FrameEvidence, car: int, yaw: float, seen: NDArray[np.bool
 
 @cache
 def _mean_car() -> tuple[Floats, NDArray[np.int64]]:
-    """Vertices, one unit long, high and wide with the origin under their middle, and triangles."""
+    """Vertices, scaled to length, height and width 1 with the origin at the bottom centre, and triangles."""
     prior = PCAShapePrior.load_bundled()
     coarse = prior.values(prior.initial_code(1))[0, ::2, ::2, ::2]
     mesh = sdf_to_mesh(coarse, prior.origin, 2 * prior.spacing_m)
@@ -237,7 +239,7 @@ def _mean_car() -> tuple[Floats, NDArray[np.int64]]:
 
 
 def _outline(frame: FrameEvidence, car: int, yaw: float) -> tuple[NDArray[np.bool_], float]:
-    """The mean car in the box of a car, drawn box-filling, and width over height of its image."""
+    """Image of the mean car in the box of a car, scaled to its 2D box, and the aspect of the 2D box."""
     import cv2
 
     vertices, faces = _mean_car()

@@ -1,4 +1,4 @@
-"""`check_scene`: common mistakes in the tensors of a call, measured and named with their cures."""
+"""`check_scene` finds common mistakes in the tensors of a call and names their cures."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ from directshape_torch.scene_check.words import Words
 def check_scene(
     frames: FrameBatch, detections: Detections, match_images: bool = True, words: Words | None = None
 ) -> CheckReport:
-    """Look for what is commonly wrong with images, calibration, masks and boxes (docs/check_data.md).
+    """Look for common mistakes in images, calibration, masks and boxes (docs/check_data.md).
 
-    Among it: the centre of a box for its bottom, headings in degrees, off by 90 or 180 degrees or of the other sign,
+    Examples are the centre of a box for its bottom, headings in degrees, off by 90 or 180 degrees or of the other sign,
     another order of lengths, axes of a LiDAR, intrinsics of another image size, a wrong focal length or baseline,
-    millimetres, left and right swapped, masks that are mirrored, shifted, of another frame, size or order. What a
-    mistake spoils is not reported on top of it.
+    millimetres, left and right swapped, masks that are mirrored, shifted, of another frame, size or order. Consequences
+    of a reported mistake are not reported.
 
     Args:
         frames: F frames.
-        detections: B cars; the more, the more is seen.
-        match_images: match features of the two images too, which takes a second a frame; it shows whether they are
-            rectified and of the same scene.
-        words: in which findings speak; default those of `detections.convention`.
+        detections: B cars; more cars show more mistakes.
+        match_images: whether to match features of the two images too, which takes a second for each frame and shows
+            whether they are rectified and show the same scene.
+        words: wording of the findings. Default: that of `detections.convention`.
 
     Returns:
-        The findings; printed, it says what was measured, what was expected, and how to mend it.
+        The report; printed, it says what was measured, what was expected, and how to correct it.
 
     Raises:
-        InputError: other types.
+        InputError: an argument has another type.
 
     Examples:
         >>> import torch
@@ -91,7 +91,7 @@ def _check_camera(one: FrameEvidence) -> list[Finding]:
 
 
 def check_cars(frames: Sequence[FrameEvidence]) -> list[Finding]:
-    """Boxes, masks and distances, each only where what it rests on was found right."""
+    """Findings about boxes, masks and distances, each only if the data that it depends on are right."""
     cars = np.concatenate([np.empty((0, 3)), *(measure_cars(one, *one.pair) for one in frames if one.pair is not None)])
     with_scans, frames = frames, [frame for frame in frames if len(frame.boxes)]
     swapped = check_swapped(cars)
@@ -99,7 +99,8 @@ def check_cars(frames: Sequence[FrameEvidence]) -> list[Finding]:
         return swapped
     of_boxes = check_box_2d(frames) or check_boxes(frames)
     if any(finding.severity == "error" for finding in of_boxes):
-        # Masks are found by the boxes and distances are those of the boxes, so they would only say the same again.
+        # Masks are found by the boxes and distances are of the boxes, so these would only report the same mistake
+        # again.
         if "masks_elsewhere" in names(of_boxes):
             return of_boxes
         explained = names(of_boxes) != {"box_projection"}
@@ -107,13 +108,13 @@ def check_cars(frames: Sequence[FrameEvidence]) -> list[Finding]:
         return [*of_boxes, *(found for found in of_masks if found.check != "masks_elsewhere" or not explained)]
     found = [*of_boxes, *check_corners(frames), *check_masks(frames)]
     of_places = [*check_distances(cars), *check_heading(frames)]
-    # A wrong baseline moves what the images say, not the points.
+    # A wrong baseline changes the measurements of the images, not the points.
     of_scans = [] if "distance_scale" in {finding.check for finding in of_places} else check_lidar(with_scans)
     return [*found, *of_places, *of_scans]
 
 
 def _once(findings: Sequence[Finding]) -> list[Finding]:
-    """The first finding of each kind: frames of a call mostly share their camera."""
+    """The first finding of each kind, since frames of a call mostly share their camera."""
     return list({finding.check: finding for finding in reversed(findings)}.values())[::-1]
 
 

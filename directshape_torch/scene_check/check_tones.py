@@ -1,4 +1,4 @@
-"""Whether the grey levels of a pair are those of photographs, and alike on both sides: photometry compares them."""
+"""This module checks whether grey levels are those of photographs and alike on both sides, as photometry needs."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from numpy.typing import NDArray
 
 from directshape_torch.scene_check.finding import Finding, Severity, found
 
-# Of 72 real and rendered pairs the 99th percentile is 219 at least, the quantiles of the sides differ by 15 at most,
-# saturated are 16 % at most, and the rows of the two sides correlate by 0.94 at least.
+# For 72 real and rendered pairs the 99th percentile is at least 219, the quantiles of the sides differ by at most 15,
+# at most 16 % are saturated, and the rows of the two sides correlate by at least 0.94.
 _DARK_LEVEL, _LEAST_SPREAD, _MOST_SATURATED = 64.0, 4.0, 0.5
 _MOST_APART, _LEAST_CORRELATION = 30.0, -0.3
-# By how much colours must be more alike with red and blue exchanged on one side, as a share and in levels.
+# Colours must be more alike by this, as a share and in levels, if red and blue are exchanged on one side.
 _EXCHANGED_SHARE, _EXCHANGED_LEVELS = 0.7, 2.0
 _QUANTILES = (5, 25, 50, 75, 95)
 _GREY = np.array([0.299, 0.587, 0.114])
 
 
 def check_tones(left: NDArray[np.uint8], right: NDArray[np.uint8], where: str) -> list[Finding]:
-    """What the levels of two images (H, W, 3) show by themselves and side by side; the worst alone."""
+    """The most severe finding from the levels of two images (H, W, 3), of each and compared, or none."""
     greys = {"left": left @ _GREY, "right": right @ _GREY}
     for side, grey in greys.items():
         if finding := _check_side(grey, f"{where}, {side} image"):

@@ -1,4 +1,4 @@
-"""The ways in which other tools write 3D boxes and focal lengths, and how well boxes explain the image under each."""
+"""This module has other tools' conventions of 3D boxes and focal lengths, and scores how they explain images."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _identity(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _axes(*signed: int) -> Callable[[Points], Points]:
-    """Axes 1, 2, 3 of the file, with their signs, that become x, y, z."""
+    """A function that takes axes 1, 2, 3 of the file, with their signs, as x, y, z."""
     index, sign = [abs(axis) - 1 for axis in signed], np.sign(signed)
     return lambda points: points[:, index] * sign
 
@@ -36,14 +36,16 @@ AS_DOCUMENTED = "as documented"
 
 @dataclass(frozen=True)
 class Axes:
-    """Other axes of boxes that were read as documented: what brings locations (N, 3) and KITTI's headings (N,) of the
-    left camera's frame to what they should be there."""
+    """An `Axes` corrects boxes that were read as documented but have other axes.
+
+    It maps locations (N, 3) and KITTI's headings (N,) in the left camera's frame to the correct ones.
+    """
 
     points: Callable[[Points], Points] = _identity
     yaw: Callable[[Angles], Angles] = _identity
 
 
-# Of boxes in a camera's frame; their headings count as documented.
+# These are for boxes in a camera's frame; their headings count as documented.
 _CAMERA_AXES: dict[str, Axes] = {
     AS_DOCUMENTED: Axes(),
     "x to the left (left-handed)": Axes(_axes(-1, 2, 3)),
@@ -53,7 +55,7 @@ _CAMERA_AXES: dict[str, Axes] = {
     "z up, y forward": Axes(_axes(1, -3, 2)),
 }
 _A_CAMERAS = "a camera's: x right, y down, z forward"
-# Of boxes that a motion took to the camera, headings too, from a frame with z up.
+# These are for boxes, also headings, that a motion transformed to the camera from a frame with z up.
 _UPRIGHT_AXES: dict[str, Axes] = {
     AS_DOCUMENTED: Axes(),
     "left-handed, sideways the other way round": Axes(_axes(-1, 2, 3), lambda yaw: np.pi - yaw),
@@ -64,7 +66,7 @@ _UPRIGHT_AXES: dict[str, Axes] = {
     f"{_A_CAMERAS}, not x right, y forward, z up": Axes(_axes(1, 3, -2), np.negative),
 }
 _DOWN = np.array([0.0, 1.0, 0.0])
-# Share of the height that is to be added to y.
+# This share of the height is added to y.
 ORIGINS: dict[str, float] = {AS_DOCUMENTED: 0.0, "lower by a half": 0.5, "lower by a height": 1.0, "higher": -0.5}
 _POINTS = {0.0: "centre of the bottom face", 0.5: "centre of the box", 1.0: "top of the box"}
 YAWS: dict[str, Callable[[Angles], Angles]] = {
@@ -75,13 +77,13 @@ YAWS: dict[str, Callable[[Angles], Angles]] = {
     "degrees": np.deg2rad,
     "degrees, opposite sign": lambda yaw: -np.deg2rad(yaw),
 }
-# The order in the place of h w l; which of these are h, w, l.
+# These are orders in the place of h w l, with the indices of h, w and l.
 ORDERS: dict[str, tuple[int, int, int]] = {
     AS_DOCUMENTED if order == "hwl" else " ".join(order): (order.index("h"), order.index("w"), order.index("l"))
     for order in map("".join, permutations("hwl"))
 }
-# Factors that bring what is given to pixels and metres. Millimetres, feet, halves; distances of a detector that is
-# trained for another camera may be off by more than a quarter, and are judged by the images.
+# These factors convert the given values to pixels and metres, for example from millimetres, feet or halves. Distances
+# of a detector that was trained for another camera may be wrong by more than a quarter, and are checked by the images.
 FOCALS = (0.4, 0.5, 0.6, 0.7, 0.8, 1.25, 1.4, 1.6, 2.0, 2.5)
 DISTANCES = (0.001, 0.01, 0.1, 0.3048, 0.5, 0.65, 1.5, 2.0, 1 / 0.3048, 10.0, 100.0, 1000.0)
 SIZES = (0.5, 2.0)
@@ -89,9 +91,9 @@ SIZES = (0.5, 2.0)
 
 @dataclass(frozen=True)
 class BoxConvention:
-    """One way to write a box; each part is a key of a table above, or a factor."""
+    """A `BoxConvention` is one way to write a box; each part is a key of a table above, or a factor."""
 
-    axes: str = AS_DOCUMENTED  # how the box is written
+    axes: str = AS_DOCUMENTED  # keys of the tables
     origin: str = AS_DOCUMENTED
     yaw: str = AS_DOCUMENTED
     order: str = AS_DOCUMENTED
@@ -105,10 +107,10 @@ class BoxConvention:
         return {part: value for part, value in vars(self).items() if value not in (AS_DOCUMENTED, 1.0)}
 
     def to_kitti(self, boxes: CarBoxes, form: BoxForm) -> CarBoxes:
-        """The boxes as they should have been read, if this is how those of a form were written."""
+        """The corrected boxes, if boxes of the given form were written in this convention."""
         hwl = self.size * boxes.hwl[:, list(ORDERS[self.order])]
         axes = _axes_of(form)[self.axes]
-        # From the bottom, which was taken to be as far below the location as the height says, to the location and back.
+        # The bottom was computed from the height, so the location is recovered from it before the correction.
         location = boxes.location - form.raised * boxes.hwl[:, :1] * _DOWN
         location = self.distance * axes.points(location)
         location = location + (form.raised + ORIGINS[self.origin]) * hwl[:, :1] * _DOWN
@@ -121,7 +123,7 @@ def _axes_of(form: BoxForm) -> dict[str, Axes]:
 
 
 def all_conventions(form: BoxForm) -> tuple[BoxConvention, ...]:
-    """Every combination of axes, origin, heading and order, the documented one first; then single factors."""
+    """Every combination of axes, origin, heading and order, the documented one first, then single factors."""
     origins = [name for name, share in ORIGINS.items() if share + form.raised in _POINTS]
     return (
         *(BoxConvention(*parts) for parts in product(_axes_of(form), origins, YAWS, ORDERS)),
@@ -132,7 +134,7 @@ def all_conventions(form: BoxForm) -> tuple[BoxConvention, ...]:
 
 
 def spoken(part: str, value: str | float, form: BoxForm) -> str:
-    """A deviation in the words of how boxes are written."""
+    """A deviation in the terms of the form of the boxes."""
     if part == "origin":
         return _POINTS[ORIGINS[str(value)] + form.raised]
     if part == "order":
@@ -143,39 +145,40 @@ def spoken(part: str, value: str | float, form: BoxForm) -> str:
     return str(value)
 
 
-# Rather the documented convention than one that explains the same a little better.
+# The documented convention is preferred to one that explains the image only a little better.
 _PENALTY_PER_DEVIATION = 0.02
-# Cars are longer than wide and wide or high; a turned box and a swapped pair of lengths project alike.
+# Cars are longer than they are wide or high. A turned box and a swapped pair of lengths have the same projection.
 _PENALTY_SHORT_CARS = 0.2
-# Mean overlap from which on 2D boxes are taken for projections of the 3D ones.
+# From this mean IoU on, 2D boxes are taken for projections of the 3D ones.
 _SAME_BOX = 0.95
-# What it counts when all observation angles agree with heading and place.
+# This is added to the score if all observation angles agree with heading and position.
 _ANGLE_WEIGHT = 0.15
 _ANGLE_TOLERANCE_RAD = 0.06
-# KITTI's number for angles that are not known, and what is no angle in radians.
+# Larger angles are KITTI's number for unknown angles, or are not in radians.
 _MAX_ANGLE_RAD = 2 * np.pi + 0.01
 
 
 class ConventionScores(NamedTuple):
-    """How well boxes explain what the image shows, for C conventions."""
+    """A `ConventionScores` says how well boxes explain the image, for C conventions."""
 
     conventions: tuple[BoxConvention, ...]  # the documented one first
-    overlap: NDArray[np.float64]  # (C, N) of N projected boxes with what the image shows
-    score: NDArray[np.float64]  # (C,) mean overlap less a penalty for deviations
-    # (C,) share of the cars whose observation angle `alpha` agrees with heading and place; None where it says nothing.
+    overlap: NDArray[np.float64]  # (C, N) IoU of N projected boxes with the image's boxes
+    score: NDArray[np.float64]  # (C,) mean IoU less a penalty for deviations
+    # (C,) share of the cars whose observation angle `alpha` agrees with heading and position; None if alpha is
+    # unusable.
     angle_share: NDArray[np.float64] | None
 
     @property
     def score_with_angles(self) -> NDArray[np.float64]:  # (C,)
-        """The same with a premium for observation angles that agree."""
+        """The scores with a bonus for observation angles that agree."""
         return np.asarray(self.score + _ANGLE_WEIGHT * (0.0 if self.angle_share is None else self.angle_share))
 
 
 def score_conventions(frames: Sequence[FrameEvidence]) -> ConventionScores:
-    """The scores over the cars of all frames; there must be at least one.
+    """The scores over the cars of all frames, which must have at least one car.
 
-    What the image shows are the 2D box of the detection and the masks, whichever fits best; where the 2D boxes were
-    only projected from the 3D ones, the masks alone, and as many cars as there are masks.
+    Projected boxes are compared with the 2D box of the detection and with the masks, and the best IoU counts. If the 2D
+    boxes are projections of the 3D ones, only masks are used, and only as many cars as there are masks.
     """
     conventions = all_conventions(frames[0].words.form)
     projections = boxes_are_projections(frames)
@@ -183,8 +186,8 @@ def score_conventions(frames: Sequence[FrameEvidence]) -> ConventionScores:
     median_hwl = np.median(np.concatenate([frame.boxes.hwl for frame in frames]), axis=0)
     penalty = np.array([_penalty(convention, median_hwl) for convention in conventions])
     alpha, angle_share = np.concatenate([frame.boxes.alpha for frame in frames]), None
-    if (np.abs(alpha) <= _MAX_ANGLE_RAD).all() and (len(alpha) == 1 or np.ptp(alpha) > 0):  # not of NaN
-        # Neither origin nor order changes an angle seen from above.
+    if (np.abs(alpha) <= _MAX_ANGLE_RAD).all() and (len(alpha) == 1 or np.ptp(alpha) > 0):  # false for NaN
+        # Origin and order do not change an angle seen from above.
         share = {
             (axes, yaw): _angles_agree(BoxConvention(axes, yaw=yaw), frames)
             for axes, yaw in product({each.axes for each in conventions}, YAWS)
@@ -194,7 +197,7 @@ def score_conventions(frames: Sequence[FrameEvidence]) -> ConventionScores:
 
 
 def _angles_agree(convention: BoxConvention, frames: Sequence[FrameEvidence]) -> float:
-    """Share of the cars with `alpha = rotation_y - atan2(x, z)`, about."""
+    """Share of the cars with `alpha = rotation_y - atan2(x, z)` within the tolerance."""
     agree = []
     for boxes in (convention.to_kitti(frame.boxes, frame.words.form) for frame in frames):
         expected = boxes.rotation_y - np.arctan2(boxes.location[:, 0], boxes.location[:, 2])
@@ -211,7 +214,7 @@ def _penalty(convention: BoxConvention, median_hwl: NDArray[np.float64]) -> floa
 
 def _overlaps(
     frame: FrameEvidence, conventions: Sequence[BoxConvention], boxes_are_projections: bool
-) -> NDArray[np.float64]:  # (C, N), or the best of each convention where not every car can have a mask
+) -> NDArray[np.float64]:  # (C, N), or the best cars of each convention if there are fewer masks
     projected = project_conventions(frame, conventions)
     overlaps = np.zeros(projected.shape[:2])
     for car in range(len(frame.boxes)):
@@ -225,9 +228,9 @@ def _overlaps(
 
 
 def boxes_are_projections(frames: Sequence[FrameEvidence]) -> bool:
-    """Whether the 2D boxes were made from the 3D ones, read as documented, and so say nothing about them.
+    """Whether the 2D boxes are projections of the 3D ones, read as documented, and so contain no evidence.
 
-    Where there are no masks they are all that there is.
+    Without masks the 2D boxes are used in any case.
     """
     if not any(frame.num_masks["left"] for frame in frames):
         return False

@@ -1,4 +1,4 @@
-"""What is wrong, or looks wrong, with data: findings, their report, and one table of what is commonly wrong."""
+"""This module has findings about data, their report, and a table of common mistakes."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 @dataclass(frozen=True)
 class Finding:
-    """What a check measured, and what to do about it.
+    """A `Finding` is the measurement of a check with its cure.
 
     Attributes:
-        check: its name in the table of docs/check_data.md.
-        severity: "error" spoils results; "warning" may; "note" says what could not be checked.
+        check: name of the check in the table of docs/check_data.md.
+        severity: "error" spoils results; "warning" may; "note" names what could not be checked.
         where: a frame, a file, or "all frames".
-        measured: what was found, with numbers.
-        expected: what it should have been.
-        cure: how to mend it.
-        places: of a finding that stands for several of its kind each of their `where`, in order; else empty.
+        measured: measurement, with numbers.
+        expected: expected value.
+        cure: how to correct the data.
+        places: if the finding stands for several of its kind, the `where` of each, in order; else empty.
     """
 
     check: str
@@ -35,11 +35,11 @@ class Finding:
     places: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        """One line."""
+        """The finding in one line."""
         return f"{self.severity}: {self.check} ({self.where}): {self.measured}; expected {self.expected}; {self.cure}"
 
     def block(self) -> str:
-        """Four lines."""
+        """The finding in four lines."""
         return (
             f"{self.severity}: {self.check} ({self.where})\n"
             f"  measured  {self.measured}\n"
@@ -49,20 +49,20 @@ class Finding:
 
 
 def unreadable(check: str, where: str, expected: str, error: Exception, cure: str) -> Finding:
-    """A file that cannot be used, in the words of its error, which ends with a cure of its own or is given one."""
+    """A finding about an unusable file with the text of its error, and with `cure` if the error has none."""
     measured, _, own_cure = " ".join(str(error).split()).partition("; ")
     return Finding(check, "error", where, measured, expected, own_cure or cure)
 
 
 @dataclass(frozen=True)
 class CheckReport:
-    """All findings about a data set.
+    """A `CheckReport` has all findings about a data set.
 
     Attributes:
-        findings: errors first.
-        num_frames: frames of the data set.
-        num_checked: frames whose content was read.
-        num_cars: detections of the refined classes in these.
+        findings: findings, errors first.
+        num_frames: number of frames of the data set.
+        num_checked: number of frames whose content was read.
+        num_cars: number of detections of the refined classes in these frames.
     """
 
     findings: tuple[Finding, ...]
@@ -71,11 +71,11 @@ class CheckReport:
     num_cars: int
 
     def count(self, severity: Severity) -> int:
-        """How many findings there are of a severity."""
+        """Number of findings of a severity."""
         return sum(finding.severity == severity for finding in self.findings)
 
     def __str__(self) -> str:
-        """One block a finding, and a last line."""
+        """The report as one block for each finding, and a last line with counts."""
         counts = ", ".join(f"{n} {name}{'' if n == 1 else 's'}" for name in SEVERITIES for n in [self.count(name)])
         of = "" if self.num_checked == self.num_frames else f" of {self.num_frames}"
         last = f"{counts} in {self.num_checked}{of} frames with {self.num_cars} cars"
@@ -88,7 +88,7 @@ class CheckReport:
 
 
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Errors, then warnings, then notes; else in their order. Findings of one kind about single frames are one."""
+    """Errors, then warnings, then notes, in their order; findings of one kind about single frames are merged."""
     groups: dict[tuple[str, ...], list[Finding]] = {}
     for finding in findings:
         kind = ("frame",) if finding.where.split()[0:1] == ["frame"] else (finding.where, finding.measured)
@@ -97,7 +97,7 @@ def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def _merged(findings: Sequence[Finding]) -> Finding:
-    """The first of several, with the places of all."""
+    """The first finding with the places of all."""
     first = findings[0]
     if len(findings) == 1:
         return first
@@ -106,7 +106,7 @@ def _merged(findings: Sequence[Finding]) -> Finding:
 
 
 def names(findings: Iterable[Finding]) -> set[str]:
-    """The checks that found more than a warning."""
+    """Names of the checks with findings other than warnings."""
     return {finding.check for finding in findings if finding.severity != "warning"}
 
 
@@ -114,13 +114,13 @@ SAID_BY_THE_RUN = frozenset(
     {"left_image", "right_image", "image_size", "calibration_file", "detection_file", "mask_file", "mask_size"}
     | {"plane_file", "lidar_file", "no_cars"}
 )
-"""Findings about files that a run cannot read either, which it says of each frame."""
+"""The run itself reports these findings about files, for each frame."""
 
 
 class Mistake(NamedTuple):
-    """A kind of mistake. What depends on the case is in braces, for `str.format`.
+    """A `Mistake` is a kind of mistake, with fields in braces for `str.format`.
 
-    Kinds without words here have them in `Words`, as they are mended differently in each source of data.
+    Kinds without texts here have them in `Words`, because their cure depends on the source of data.
     """
 
     severity: Severity
@@ -225,7 +225,7 @@ MISTAKES: dict[str, Mistake] = {
 
 
 def of_cars(count: int) -> str:
-    """Where a finding about all cars is."""
+    """The place of a finding about all cars."""
     return f"all frames, {count} cars"
 
 
@@ -240,7 +240,7 @@ def found(
     cure: str = "",
     **numbers: float | str,
 ) -> Finding:
-    """A finding with what the table or the words of its source say of its kind, unless something else is said here."""
+    """A finding with the texts of the table or of its source, unless other texts are given."""
     kind = MISTAKES[check]
     own = {} if words is None else words.says
     says = Says(kind.expected, kind.cure) if kind.expected else own[check]

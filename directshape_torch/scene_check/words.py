@@ -1,4 +1,4 @@
-"""What boxes, masks and calibration are called where they came from: in tensors of a convention, and in files."""
+"""This module has the terms for boxes, masks and calibration in each source of data: tensors and files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from directshape_torch.geometry.box_formats import BoxForm, BoxFormat, box_form
 
 
 class Says(NamedTuple):
-    """What should be there, and the cure. What depends on the case is in braces, for `str.format`."""
+    """A `Says` has the expectation and the cure of a mistake, with fields in braces for `str.format`."""
 
     expected: str
     cure: str
@@ -19,12 +19,12 @@ class Says(NamedTuple):
 
 @dataclass(frozen=True)
 class Words:
-    """The words of one source of data.
+    """A `Words` has the terms of one source of data.
 
     Attributes:
-        form: how its boxes are written.
-        says: expectation and cure of the kinds of mistakes that are mended differently in each source.
-        calibration_file, detection_file: what such a file holds, in words; "" for tensors.
+        form: form of the boxes.
+        says: expectation and cure of the mistakes whose cure depends on the source.
+        calibration_file, detection_file: content of such a file, in words; "" for tensors.
     """
 
     form: BoxForm
@@ -41,7 +41,7 @@ _FOLDER_FORM = replace(
 
 
 def words_of_tensors(convention: BoxFormat) -> Words:
-    """Of a call with tensors, whose boxes were written in a convention."""
+    """The terms for tensors whose boxes were written in a convention."""
     form = box_form(convention)
     says = {
         **_of_boxes(form),
@@ -63,7 +63,7 @@ _UNITS_IN_FILES = Says("{low} to {high} m", "write metres (for larger vehicles u
 
 
 def words_of_files(calibration: Path, names: tuple[str, str] = ("P2", "P3")) -> Words:
-    """Of a data set, by its calibration file and the names of the two cameras in it."""
+    """The terms for a data set, given its calibration file and the names of the two cameras in it."""
     return _words_of_folder() if calibration.suffix.lower() == ".json" else _words_of_kitti(*names)
 
 
@@ -146,4 +146,4 @@ def _of_boxes(form: BoxForm) -> dict[str, Says]:
 
 
 KITTI_FILES = _words_of_kitti("P2", "P3")
-"""The words of the benchmark's own files."""
+"""These are the terms for KITTI's own files."""
