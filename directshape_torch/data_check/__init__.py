@@ -1,1 +1,1 @@
-"""What is wrong with a stereo data set on disk: its files, and the scenes in them."""
+"""This package checks a stereo data set on disk: its files, and the scenes in them."""

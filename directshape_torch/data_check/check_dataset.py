@@ -1,4 +1,4 @@
-"""All checks over a data set."""
+"""This module runs all checks over a data set."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from directshape_torch.scene_check.words import words_of_files
 DEFAULT_MAX_FRAMES = 20
 REPORT_SCHEMA_VERSION = 1
 _NAMED = 3
-# 0.15 px are 0.35 m at 30 m on KITTI's rig.
+# An offset of 0.15 px is 0.35 m at 30 m on KITTI's rig.
 LARGEST_OFFSET_PX, LARGEST_BIAS = 0.15, 0.03
 _SURE = 2.0  # standard deviations
-_FEWEST_CARS = 10  # of fewer the noise of a detector is a guess
+_FEWEST_CARS = 10  # with fewer cars the noise of a detector is not known
 
 
 def check_dataset(
@@ -33,22 +33,23 @@ def check_dataset(
     max_frames: int | None = DEFAULT_MAX_FRAMES,
     tell: Callable[[str], object] = lambda _: None,
 ) -> CheckReport:
-    """Look for everything that is commonly wrong with a data set.
+    """Check a data set for common mistakes.
 
     Args:
-        dataset: of any layout.
-        max_frames: frames whose content is read, spread evenly; None: all. That files exist is asked of every frame.
-        tell: called after each frame that was read.
+        dataset: data set of any layout.
+        max_frames: number of frames whose content is read, evenly spread; None reads all. The existence of files is
+            checked for all frames.
+        tell: function that is called after each frame that was read.
 
     Raises:
-        InputError: `max_frames` below 1.
+        InputError: `max_frames` is below 1.
     """
     if max_frames is not None and max_frames < 1:
         raise InputError("max_frames", "at least 1", str(max_frames))
     chosen = spread(dataset.frame_ids, max_frames)
     findings, num_cars = check_frames(dataset, chosen, tell)
     findings = [*check_files(dataset), *findings]
-    # Of boxes or images that are wrong an estimate would only say the same again.
+    # If boxes or images are wrong, the estimate of the rig would only report the same mistake again.
     if not any(finding.severity == "error" for finding in findings):
         findings += check_rig(dataset, chosen)
     return CheckReport(by_severity(findings), len(dataset), len(chosen), num_cars)
@@ -60,11 +61,11 @@ def check_frames(
     tell: Callable[[str], object] = lambda _: None,
     match_images: bool = True,
 ) -> tuple[list[Finding], int]:
-    """What some frames show one by one and together, and the number of their cars.
+    """Findings about frames, one by one and together, and the number of their cars.
 
     Args:
-        dataset, tell: as in `check_dataset`.
-        frame_ids: the frames.
+        dataset, tell: see `check_dataset`.
+        frame_ids: frames to check.
         match_images: whether features of both images are matched, which takes most of the time.
     """
     findings: list[Finding] = []
@@ -83,14 +84,14 @@ def check_frames(
 
 
 def spread(frame_ids: Sequence[str], count: int | None) -> tuple[str, ...]:
-    """At most `count` of the frames, evenly spread, the first among them."""
+    """At most `count` of the frames, evenly spread, including the first."""
     if count is None or count >= len(frame_ids):
         return tuple(frame_ids)
     return tuple(frame_ids[index * len(frame_ids) // count] for index in range(count))
 
 
 def check_files(dataset: StereoDataset) -> list[Finding]:
-    """One finding for each kind of file that is missing; looks at names only, so all frames can be asked."""
+    """One finding for each kind of missing file in all frames; only the existence of files is checked."""
     missing: dict[str, list[str]] = {}
     for frame_id in dataset.frame_ids:
         for role, path in _files(dataset, frame_id):
@@ -103,7 +104,7 @@ def _files(dataset: StereoDataset, frame_id: str) -> Iterable[tuple[str, Path]]:
     try:
         return [(role.rstrip("_0123456789"), path) for role, path in dataset.input_files(frame_id).items()]
     except DataFormatError as error:
-        # A file that names others is itself missing, or damaged: then that is found when the frame is read.
+        # A file that lists other files is missing or damaged, which is found when the frame is read.
         files = dataset.layout.files(frame_id)
         return [("image_left", files.left), ("image_right", files.right), ("list of masks", error.path)]
 
@@ -115,7 +116,7 @@ def _missing(role: str, paths: list[str], num_frames: int) -> Finding:
 
 
 def report_content(report: CheckReport) -> dict[str, Any]:
-    """A report for programs (schema 1)."""
+    """A report as JSON values (schema 1)."""
     return {
         "schema_version": REPORT_SCHEMA_VERSION,
         "frames": report.num_frames,
@@ -126,10 +127,10 @@ def report_content(report: CheckReport) -> dict[str, Any]:
 
 
 def check_rig(dataset: StereoDataset, frame_ids: Sequence[str]) -> list[Finding]:
-    """What the detections of some frames say of their rigs beyond the disparity fields that the data set has."""
+    """Findings about the errors of rigs, estimated from detections, beyond the disparity fields of the data set."""
     plain, rigs = replace(dataset, ground="camera_height", disparity_fields=()), list[RigEstimate]()
     for frame_id in frame_ids:
-        # What cannot be read was found before.
+        # Unreadable files have been reported before.
         with suppress(DirectShapeError, OSError):
             loaded = plain.load(frame_id)
             rig_among(rigs, Rig.of_frame(loaded.frame)).update(loaded.frame, loaded.detections)

@@ -1,4 +1,4 @@
-"""Everything of one frame, each part read for itself, so that one damaged file hides nothing about the others."""
+"""This module checks one frame; parts are read separately, so that a damaged file does not hide other mistakes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _SOME_MASKS = 3
 
 
 class _Attempts:
-    """Reads the parts of a frame, and keeps what is found where one cannot be read."""
+    """An `_Attempts` reads the parts of a frame and keeps the findings about unreadable parts."""
 
     def __init__(self, where: str) -> None:
         self.where, self.findings = where, list[Finding]()
@@ -54,7 +54,7 @@ class _Attempts:
                 check, expected = "mask_size", "masks of the size of their image"
             found = unreadable(check, self.where, expected, error, "check the path and the file")
             is_missing = isinstance(error, DataFormatError) and not error.path.exists()
-            # That a file is missing is found for all frames at once, and one file may hold several parts.
+            # Missing files are reported for all frames at once, and one file may contain several parts.
             if not is_missing and found.measured not in {finding.measured for finding in self.findings}:
                 self.findings.append(found)
             return None
@@ -63,8 +63,11 @@ class _Attempts:
 def check_frame(
     dataset: StereoDataset, frame_id: str, match_images: bool = True
 ) -> tuple[list[Finding], int, FrameEvidence | None]:
-    """All findings about a frame, the number of its cars, and what it shows of them, None where its images or its
-    calibration are wrong. Its two images are matched by their features only where that is asked for."""
+    """All findings about a frame, the number of its cars, and the evidence of its cars.
+
+    The evidence is None if images or calibration are wrong. Features of the two images are matched only if
+    `match_images`.
+    """
     files, attempt = dataset.layout.files(frame_id), _Attempts(f"frame {frame_id}")
     words = words_of_files(files.calibration)
     pair = _read_pair(files, attempt)
@@ -74,7 +77,7 @@ def check_frame(
     if size_hw is not None and calibration is not None:
         same_size = partial(calibration.of_size, size_hw[::-1])
         if attempt("image_size", "the size that the calibration is of", same_size) is None:
-            pair = size_hw = None  # what rests on both would only say the same again
+            pair = size_hw = None  # other checks of these would only report the same mistake again
     objects = attempt("detection_file", words.detection_file, files.read_objects)
     masks = None
     if size_hw is not None and dataset.masks is not None:
@@ -83,10 +86,10 @@ def check_frame(
     findings, camera = attempt.findings, None
     if calibration is not None:
         findings += check_calibration(*numbers_of(calibration), size_hw, attempt.where, words)
-        # One that is no stereo pair's has been found by that. A singular matrix is a RuntimeError.
+        # A calibration without a stereo pair was reported above. A singular matrix raises RuntimeError.
         with suppress(DirectShapeError, RuntimeError):
             camera = to_stereo_camera(calibration)
-    # A wrong calibration must not spoil what the images say by themselves.
+    # A wrong calibration must not affect the checks of the images themselves.
     camera = None if names(findings) & SPOILS_CAMERA else camera
     if pair is not None:
         findings += check_tones(*pair, attempt.where)
@@ -110,7 +113,7 @@ def check_frame(
 
 
 def _scan(dataset: StereoDataset, files: FrameFiles) -> Scan | None:
-    """The LiDAR scan of a frame, None where the data set has none."""
+    """The LiDAR scan of a frame, or None if the data set has none."""
     if dataset.lidar_dir is None:
         return None
     path = files.within(dataset.lidar_dir, ".bin")
@@ -127,7 +130,7 @@ def _read_pair(files: FrameFiles, attempt: _Attempts) -> Pair | None:
 
 
 def numbers_of(calibration: KittiCalibration) -> tuple[dict[str, NDArray[np.float64]], float]:
-    """Intrinsics by camera, and the baseline in metres, NaN where a focal length is 0."""
+    """Intrinsics by camera, and the baseline in metres, which is NaN if a focal length is 0."""
     P = {
         f"{name} of {calibration.path.name}": matrix
         for name, matrix in zip(calibration.names, (calibration.P2, calibration.P3), strict=True)
@@ -144,8 +147,10 @@ def _evidence(
     size_hw: tuple[int, int],
     words: Words,
 ) -> FrameEvidence:
-    """Masks are matched by 2D boxes alone, for the 3D ones are what is in question. Those of the right image are held
-    against the same boxes, where they should fit less well."""
+    """The evidence of a frame's cars, with masks matched by 2D boxes only, because 3D boxes are checked.
+
+    Masks of the right image are compared with the same boxes, which should fit them less well.
+    """
     boxes = CarBoxes(
         _columns([o.location_ref for o in cars], 3),
         _columns([o.hwl for o in cars], 3),
@@ -153,7 +158,7 @@ def _evidence(
         np.array([o.alpha for o in cars], dtype=np.float64),
         own_boxes_2d(cars),
     )
-    # Where the file has no 2D box nothing but the projected 3D box says where the mask may be.
+    # Without a 2D box in the file the mask can only be found by the projected 3D box.
     T_cam_obj = poses_cam(cars, camera.t_cam_ref[0])
     projected, _ = project_boxes(T_cam_obj, torch.from_numpy(boxes.hwl), camera, size_hw)
     expected = np.where((boxes.box_2d == 0).all(axis=1, keepdims=True), projected, boxes.box_2d)
@@ -190,10 +195,10 @@ def _telling(
     masks_left: Sequence[int],
     boxes_2d: NDArray[np.float64],  # (N, 4)
 ) -> list[int]:
-    """The cars that tell most, as `Detections.telling_rows` chooses them.
+    """The rows of the most informative cars, chosen as in `Detections.telling_rows`.
 
-    Where some have a mask, those that have neither a mask nor a 2D box tell nothing: lists that are written down to low
-    scores are full of boxes without a car.
+    If some cars have a mask, cars without mask and 2D box are left out, because detections of low score are often boxes
+    without a car.
     """
     known = (boxes_2d != 0).any(axis=1) | (np.array(masks_left, dtype=np.int64) >= 0)
     some = sum(mask >= 0 for mask in masks_left) >= _SOME_MASKS
