@@ -1,4 +1,4 @@
-"""The table of cars: one row of numbers and words each, and which frames of them get pictures."""
+"""This module makes the table of cars, one row for each car, and chooses the frames that get pictures."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from directshape_torch.report.page_parts import known
 from directshape_torch.visualize.drawn_car import is_refined
 
 CarRow = dict[str, Any]
-"""One car of the table by the names of its columns; None for what is not known."""
+"""This is one car of the table by the names of its columns; None stands for unknown values."""
 
-# Errors against the label, and whether `directshape compare` would count it.
+# These are errors against the label, and whether `directshape compare` would count it.
 _JUDGED: CarRow = dict.fromkeys(
     ("counts", "centre_before_m", "centre_after_m", "yaw_before_deg", "yaw_after_deg", "iou_before", "iou_after")
 )
@@ -27,7 +27,7 @@ def car_rows(
     detections: Sequence[KittiObject] | None = None,
     labels: Sequence[KittiObject] | None = None,
 ) -> list[CarRow]:
-    """The rows of the frame of that number in the page; without detections or labels what follows from them is None."""
+    """The rows of a frame with its number in the page; values that need missing detections or labels are None."""
     judged = {} if labels is None else _judged(detections, result.cars, labels)
     return [{**_row(frame, result, car), **_JUDGED, **judged.get(car, {})} for car in range(len(result.cars))]
 
@@ -35,25 +35,25 @@ def car_rows(
 def _row(frame: int, result: FrameResult, car: int) -> CarRow:
     shapes, kitti = result.shapes, result.cars[car]
     ious = [known(array[car]) for array in (shapes.mask_iou_left, shapes.mask_iou_right)]
-    # Of the result in the left camera frame, on the ground.
+    # These coordinates are of the refined car in the left camera frame.
     place = zip(("x_m", "y_m", "distance_m"), shapes.T_cam_obj[car, :3, 3], strict=True)
     sizes = zip(("height_m", "width_m", "length_m"), shapes.boxes_hwl[car], strict=True)
     return {
         "frame": frame,
         "line": int(shapes.input_lines[car]),  # in the detection file, from 1
         "track": shapes.tracks[car],  # "" for none
-        # 0 where it shares the track's shape, 1, 2 .. for later parts of one that was split, -1 alone.
+        # 0 if it shares the track's shape, 1, 2 .. for later parts of a track that was split, -1 without sharing.
         "track_part": int(shapes.track_parts[car]),
         "type": kitti.type,
         "status": shapes.statuses[car],
         "refined": is_refined(shapes.statuses[car]),
         **{name: known(value, 2) for name, value in place},
-        "score": known(kitti.score),  # the detector's
+        "score": known(kitti.score),  # confidence of the detector
         "cost_before": known(shapes.costs_before[car].sum()),
         "cost_after": known(shapes.costs_after[car].sum()),
         "mask_iou": ious[0] if ious[0] is not None else ious[1],  # of the left mask, else of the right one
         "photometric_error_grey": known(shapes.photometric_errors_grey[car], 2),  # mean, 0..255
-        "probability_better": known(shapes.probabilities_better[car]),  # calibrated, as the next two
+        "probability_better": known(shapes.probabilities_better[car]),  # calibrated, as the next value
         "probability_not_worse": known(shapes.probabilities_not_worse[car]),
         "distance_in_sigmas": known(shapes.distances_in_sigmas[car], 2),  # between the boxes of images and detector
         "sigma_depth_m": known(shapes.sigmas_ref[car, 2]),
@@ -66,9 +66,9 @@ def _row(frame: int, result: FrameResult, car: int) -> CarRow:
 def _judged(
     before: Sequence[KittiObject] | None, after: Sequence[KittiObject], labels: Sequence[KittiObject]
 ) -> dict[int, dict[str, Any]]:
-    """For each place in `after` whose car has a label: whether that counts, and the errors before and after.
+    """Whether the label counts, and the errors before and after, for each index in `after` with a label.
 
-    Cars are matched by their 2D boxes, which a refinement leaves alone.
+    Cars are matched by their 2D boxes, which a refinement does not change.
     """
     found, types = match_to_labels(after, labels), {o.type for o in after}
     judged: dict[int, dict[str, Any]] = {car: {"counts": is_counted(label, types)} for car, label in found.items()}
@@ -81,10 +81,10 @@ def _judged(
 
 
 def car_gains(rows: Sequence[CarRow]) -> list[tuple[float, int]]:
-    """How much better each car became, and the number of its frame, worst first.
+    """The improvement of each refined car and the number of its frame, worst first.
 
-    By the overlap with the label where the run has labels, else by the probability to be not worse; the two cannot be
-    compared. Cars that were not refined have none. The page's `highlights.js` ranks by the same rule.
+    If the run has labels it is the change of IoU with the label, else the probability to be not worse; the two cannot
+    be compared. The page's `highlights.js` uses the same rule.
     """
     refined = [row for row in rows if row["refined"]]
     judged = [(row["iou_before"], row["iou_after"], row["frame"]) for row in refined]
@@ -96,7 +96,7 @@ def car_gains(rows: Sequence[CarRow]) -> list[tuple[float, int]]:
 
 
 def choose_frames(rows: Sequence[CarRow], num_frames: int, most: int) -> list[int]:
-    """Numbers of the frames to show, ascending: those of the worst and best cars first, then evenly over the run.
+    """Numbers of the frames to show, ascending: frames of the worst and best cars first, then evenly spread ones.
 
     Examples:
         >>> choose_frames([], 10, 3)
@@ -106,7 +106,7 @@ def choose_frames(rows: Sequence[CarRow], num_frames: int, most: int) -> list[in
         return list(range(num_frames))
     gains = car_gains(rows)
     ranked = [frame for pair in zip(gains, reversed(gains), strict=True) for _, frame in pair]
-    # At most half of the frames for the extremes: a page of nothing else would mislead.
+    # At most half of the frames show extreme cars, because more would be misleading.
     chosen = list(dict.fromkeys(ranked))[: most // 2]
     evenly = [number * num_frames // most for number in range(most)]
     rest = [frame for frame in (*evenly, *range(num_frames)) if frame not in set(chosen)]

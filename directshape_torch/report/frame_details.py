@@ -1,4 +1,4 @@
-"""What the page shows of one frame beside its rows: pictures of cars, residual maps, and a 3D scene."""
+"""This module makes the parts of the page for one frame: pictures of cars, residual maps, and a 3D scene."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ _THUMBNAIL_PX = (360, 240)
 
 
 def frame_details(frame: RunFrame, config: RefinerConfig) -> dict[str, Any]:
-    """Parts by name, each parsed by the page when it is first needed: pictures of each car; its residual maps, costs
-    and disparity profile; and the 3D scene."""
+    """Parts of a frame by name, which the page parses on demand.
+
+    They are pictures of each car; its residual maps, costs and disparity profile; and the 3D scene.
+    """
     shapes, before, after = frame.result.shapes, frame.before, frame.after
     cars = [{"after": now} if before is None else {"before": before[k], "after": now} for k, now in enumerate(after)]
     view = None if frame.loaded is None else View.of_frame(frame.loaded.frame)
@@ -41,13 +43,13 @@ def frame_details(frame: RunFrame, config: RefinerConfig) -> dict[str, Any]:
 
 
 def _part(view: View | None, states: dict[str, DrawnCar]) -> View | None:
-    """The part of the image that shows a car in all of its states, or None where it shows none."""
+    """The part of the image that shows a car in all of its states, or None if it is not visible."""
     corners_cam = np.concatenate([state.corners_cam for state in states.values()])
     return None if view is None else view.around(corners_cam, _THUMBNAIL_PX)
 
 
 def _thumbnails(part: View | None, states: dict[str, DrawnCar]) -> dict[str, str]:
-    """Nothing for a car that the image does not show."""
+    """Pictures of a car before and after; the result is empty if the image does not show the car."""
     pictures: dict[str, str] = {}
     if part is None:
         return pictures
@@ -80,7 +82,7 @@ def _maps(
     config: RefinerConfig,
     cars: Sequence[dict[str, DrawnCar]],
 ) -> list[dict[str, str]]:
-    """Maps of each car by the names "photometric_before" and so on, where images, masks and shapes are at hand."""
+    """Residual maps of each car by names such as "photometric_before", if images, masks and shapes are available."""
     pictures: list[dict[str, str]] = [{} for _ in cars]
     rows = [row for row, states in enumerate(cars) if states["after"].is_refined and parts[row] is not None]
     if frame.loaded is None or frame.inputs.prior is None or not rows:
@@ -115,7 +117,7 @@ def _background(view: View | None, loaded: LoadedFrame | None) -> dict[str, Any]
 
 
 def _car(before: DrawnCar | None, after: DrawnCar) -> dict[str, Any]:
-    """Pose, boxes and mesh of a car; None for the mean shape, which the page has once."""
+    """Pose, boxes and mesh of a car; the mesh is None for the mean shape, which the page has once."""
     mesh = None if before is not None and after.mesh is before.mesh else after.mesh
     return {
         "T_cam_obj": numbers(after.T_cam_obj.reshape(-1), 5),

@@ -1,4 +1,4 @@
-"""The page of a run, written frame by frame, and what its top says: counts, settings, what it lacks and why."""
+"""This module writes the page of a run frame by frame, with counts, settings and notes about missing parts."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from directshape_torch.visualize.run_frames import RunFrame, RunInputs
 
 @dataclass(frozen=True)
 class ReportOutcome:
-    """What was written."""
+    """A `ReportOutcome` says what was written."""
 
     path: Path
     num_bytes: int
     num_frames: int
     num_detailed: int  # frames with pictures
     num_cars: int
-    notes: tuple[str, ...]  # what the page lacks, as it says itself
+    notes: tuple[str, ...]  # missing parts of the page, as the page itself says
 
 
 def make_report(
@@ -46,15 +46,15 @@ def make_report(
     """Write the page of the chosen frames of a run.
 
     Args:
-        inputs: which frames of the output folder of `directshape refine`, and what went in; without the shape prior
-            boxes alone, and saved meshes.
+        inputs: chosen frames of the output folder of `directshape refine`, and the inputs of the run. Without the shape
+            prior the page has only boxes and saved meshes.
         page: the HTML file to write.
-        most_frames: frames with pictures and 3D views at most; all cars are in the table all the same.
-        tell: called after each frame with details.
+        most_frames: maximum number of frames with pictures and 3D views; the table has all cars in any case.
+        tell: function that is called after each frame with details.
 
     Raises:
-        DataFormatError: a damaged file in the run.
-        ConfigError: its settings are not those of this version.
+        DataFormatError: a file of the run is damaged.
+        ConfigError: the settings of the run do not fit this version.
         InputError: `most_frames` is negative.
     """
     if most_frames < 0:
@@ -87,7 +87,7 @@ def make_report(
 
 
 def _notes(inputs: RunInputs, num_detailed: int) -> list[str]:
-    """What the page lacks because it was not given or could not be used."""
+    """Notes about parts of the page that are missing or could not be used."""
     run, dataset, notes = inputs.run, inputs.dataset, _unfinished(inputs.run.path)
     if dataset is None:
         notes.append("no pictures and no residual maps: the images were not given (--data)")
@@ -106,7 +106,7 @@ def _notes(inputs: RunInputs, num_detailed: int) -> list[str]:
 
 
 def _unfinished(out_dir: Path) -> list[str]:
-    """A note on how the run stands where it has not finished."""
+    """A note on the state of the run if it has not finished."""
     if read_log(out_dir) is None:
         return []
     status = read_status(out_dir)
@@ -117,7 +117,7 @@ def _unfinished(out_dir: Path) -> list[str]:
 def _run_facts(
     run: RunFolder, rows: Sequence[CarRow], grounds: Mapping[str, int], notes: Sequence[str]
 ) -> dict[str, Any]:
-    """The top of the page as JSON: counts, settings, mean errors, and what the reader should know about the page."""
+    """The top of the page as JSON: counts, settings, mean errors, and notes about the page."""
     manifest = run.manifest
     entries = {name: entry for name, entry in manifest.frames.items() if name in run.frame_ids}
     return {
@@ -139,7 +139,7 @@ def _run_facts(
 
 
 def _rig(run: RunFolder) -> dict[str, Any] | None:
-    """What the run estimated of its rigs, in words and as a picture; None where it did not."""
+    """The run's estimates of its rigs, in words and as a picture, or None if there are none."""
     rigs, picture = _rigs(run), run.path / RIG_PICTURE
     if not rigs:
         return None
@@ -147,7 +147,7 @@ def _rig(run: RunFolder) -> dict[str, Any] | None:
 
 
 def _rigs(run: RunFolder) -> list[RigEstimate]:
-    """The rigs of the run's folder, unless they are an earlier run's."""
+    """The rigs in the run's folder, unless they are from an earlier run."""
     words, wanted = run.path / RIG_FILE, run.manifest.sha256["stereo_bias"]
     rigs = load_rigs(words) if wanted is not None and words.is_file() else []
     return rigs if rigs and hash_fields([rig.field for rig in rigs]) == wanted else []
@@ -163,7 +163,7 @@ def _statuses(rows: Sequence[CarRow]) -> list[dict[str, Any]]:
 
 
 def _mean_errors(rows: Sequence[CarRow]) -> dict[str, Any] | None:
-    """Mean errors over the cars that `directshape compare` counts; before and after over the same cars."""
+    """Mean errors over the cars that `directshape compare` counts, before and after over the same cars."""
     counted = [row for row in rows if row["counts"]]
     if not counted:
         return None

@@ -1,6 +1,6 @@
-"""Parts of the page: template, style and programs, put inline so that it asks for nothing, and its data as JSON.
+"""This module joins template, style, scripts and data into one page that loads no other files.
 
-Numbers are rounded, meshes and pictures packed as text.
+Numbers are rounded; meshes and pictures are packed as text.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ _PER_METRE = 1000
 
 
 def page_frame(title: str) -> tuple[str, str]:
-    """The fixed parts of a page: what comes before its data and after it.
+    """The fixed parts of a page, before and after its data.
 
-    The content security policy names the page's own inline scripts by their hash and lets nothing be loaded: a script
-    or handler that came in with the data would not run even if it were not escaped.
+    The content security policy names the hashes of the page's own inline scripts and permits no loading. A script or
+    handler in the data would not run even if it were not escaped.
     """
     import_map = json.dumps({"imports": _modules()}, separators=(",", ":"))
     start = 'import "report/main";'
@@ -48,7 +48,7 @@ def page_frame(title: str) -> tuple[str, str]:
     values = {"title": html.escape(title), "policy": html.escape(policy, quote=True), "style": style}
     values |= {"import_map": import_map, "start": start}
     parts = _asset("page.html").split("{{data}}")
-    # All places in one pass: a value that looks like a place stays as it is.
+    # All placeholders are replaced in one pass, so that a value with the form of a placeholder stays unchanged.
     head, foot = (re.sub(r"\{\{(\w+)\}\}", lambda place: values[place[1]], part) for part in parts)
     return head, foot
 
@@ -67,7 +67,7 @@ def data_block(name: str, value: object) -> str:
 
 
 def _modules() -> dict[str, str]:
-    """Each module by the name it is imported by, as a data URL: pages of file:// may import no other files."""
+    """Each module as a data URL by its import name, because pages of file:// cannot import other files."""
     core, renderer, controls = (
         (_THREE / name).read_text("utf-8") for name in ("three.core.min.js", "three.module.min.js", "OrbitControls.js")
     )
@@ -97,7 +97,7 @@ def _hash(text: str) -> str:
 
 
 def known(value: float | np.floating[Any] | None, decimals: int = 4) -> float | None:
-    """A number as JSON can hold it: rounded, and None where it is not finite.
+    """A number for JSON, rounded, or None if it is not finite.
 
     Examples:
         >>> known(0.123456), known(float("nan"))
@@ -107,28 +107,28 @@ def known(value: float | np.floating[Any] | None, decimals: int = 4) -> float | 
 
 
 def numbers(values: Sequence[float] | npt.NDArray[np.floating[Any]], decimals: int = 5) -> list[float | None]:
-    """Several of them."""
+    """Numbers for JSON, rounded, with None for values that are not finite."""
     return [known(value, decimals) for value in values]
 
 
 def mesh_data(vertices_obj: npt.NDArray[Any], faces: npt.NDArray[Any]) -> dict[str, str]:
-    """A mesh in the object frame, about 7 bytes a vertex; the page's `mesh.js` is its reader.
+    """A mesh in the object frame, about 7 bytes for each vertex, in the format that the page's `mesh.js` reads.
 
-    `vertices`: x of all vertices in millimetres, then y, then z; `faces`: corners, triangle by triangle. Both int32,
-    little-endian, each number less the one before it, zlib, base64.
+    `vertices` has x of all vertices in millimetres, then y, then z; `faces` has corners, triangle by triangle. Both are
+    int32, little-endian, as differences of consecutive numbers, compressed by zlib, in base64.
     """
     millimetres = np.round(vertices_obj * _PER_METRE).astype(np.int64)
     return {"vertices": packed(millimetres.T.reshape(-1)), "faces": packed(faces.reshape(-1))}
 
 
 def packed(numbers: npt.NDArray[np.integer[Any]]) -> str:
-    """Whole numbers as text: neighbours of a mesh differ by little, and small differences deflate well."""
+    """Whole numbers as text; consecutive numbers of a mesh differ by little, and small differences compress well."""
     differences = np.diff(numbers.astype(np.int64), prepend=0).astype("<i4")
     return base64.b64encode(zlib.compress(differences.tobytes(), 9)).decode("ascii")
 
 
 def data_url(picture: Picture, quality: int = _SMALL_QUALITY) -> str:
-    """A picture (h, w, 3) as WebP in a data URL; raises `OSError` where OpenCV cannot encode it."""
+    """A picture (h, w, 3) as WebP in a data URL; `OSError` is raised if OpenCV cannot encode it."""
     encoded, content = cv2.imencode(".webp", picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
     if not encoded:
         raise OSError(f"cannot encode a picture of shape {picture.shape} as WebP")
