@@ -1,1 +1,1 @@
-"""The one place that opens files of users, with budgets, and the one that writes files, atomically."""
+"""This package opens files of users, with limits on their size, and writes files atomically; no other code does so."""

@@ -1,4 +1,4 @@
-"""Arrays of numpy in npz and npy files, which anybody may have made: sizes are checked first, nothing is unpickled."""
+"""This module reads and writes npz and npy files of numpy; sizes are checked first and nothing is unpickled."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.files.read_files import MOST_BYTES, read_bytes
 
-# The earliest date a zip entry can carry; a constant one makes equal content give equal bytes.
+# This is the earliest date of a zip entry; a constant date makes equal content give equal bytes.
 _ZIP_DATE = (1980, 1, 1, 0, 0, 0)
 _ENCRYPTED = 1
 _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 def write_npz(path: Path | str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write a compressed npz whose bytes depend on the arrays alone (`numpy.savez` stores the time of day)."""
+    """Write a compressed npz whose bytes depend only on the arrays (`numpy.savez` stores the time of day)."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, array in arrays.items():
             entry = zipfile.ZipInfo(f"{name}.npy", date_time=_ZIP_DATE)
             entry.compress_type = zipfile.ZIP_DEFLATED
-            entry.create_system = 3  # the same bytes on every operating system
+            entry.create_system = 3  # equal bytes on every operating system
             content = io.BytesIO()
             np.lib.format.write_array(content, np.asarray(array), allow_pickle=False)
             archive.writestr(entry, content.getvalue())
@@ -40,7 +40,7 @@ def read_npz(path: Path | str, cure: str = "") -> dict[str, NDArray[Any]]:
     """All arrays of an npz file by name.
 
     Raises:
-        DataFormatError: the file is missing, damaged, no npz, larger than 512 MiB unpacked, or holds Python objects.
+        DataFormatError: the file is missing, damaged, not an npz, larger than 512 MiB unpacked, or has Python objects.
 
     Examples:
         >>> import tempfile
@@ -49,23 +49,23 @@ def read_npz(path: Path | str, cure: str = "") -> dict[str, NDArray[Any]]:
         >>> read_npz(file)["codes"].shape
         (2, 5)
     """
-    # From memory: numpy leaves the file open when it turns out to be no archive.
+    # The archive is read from memory, because numpy leaves a file open if it is not an archive.
     content = io.BytesIO(read_bytes(path, cure=cure))
     try:
         _check_entries(content)
         with np.load(content, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-        # Of an entry without the ending ".npy" numpy gives the bytes.
+        # For an entry without the ending ".npy" numpy returns bytes.
         if others := [name for name, array in arrays.items() if not isinstance(array, np.ndarray)]:
             raise ValueError(f"{others[0]} is no array")
         return arrays
-    # Of an archive damaged on purpose numpy and zipfile raise whatever they come across.
+    # A manipulated archive can raise any error in numpy and zipfile.
     except Exception as error:
         raise DataFormatError(path, f"is no readable npz file ({error})", cure=cure) from error
 
 
 def _check_entries(content: io.BytesIO) -> None:
-    """Raise `ValueError` where an archive is larger than its budget, or packed as `numpy` never does."""
+    """Raise `ValueError` if an archive is larger than its limit, or packed in a way that `numpy` does not use."""
     with zipfile.ZipFile(content) as archive:
         entries = archive.infolist()
     total = sum(entry.file_size for entry in entries)
@@ -80,7 +80,7 @@ def read_npy(path: Path | str) -> NDArray[Any]:
     """The array of an npy file, read-only.
 
     Raises:
-        DataFormatError: the file is missing, damaged, no npy, larger than 512 MiB, or holds Python objects.
+        DataFormatError: the file is missing, damaged, not an npy, larger than 512 MiB, or has Python objects.
     """
     cure = "save it with numpy.save"
     content = read_bytes(path, cure=cure)
@@ -89,9 +89,9 @@ def read_npy(path: Path | str) -> NDArray[Any]:
         version = np.lib.format.read_magic(stream)
         header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, is_fortran, dtype = header(stream)
-        # What the header promises is asked of the bytes that are there: nothing is allocated for it.
+        # The shape of the header is checked against the existing bytes, so nothing is allocated for it.
         array = np.frombuffer(content, dtype, math.prod(shape), stream.tell())
         return array.reshape(shape, order="F" if is_fortran else "C")
-    # As above.
+    # A manipulated header can raise any error in numpy.
     except Exception as error:
         raise DataFormatError(path, f"is no readable npy file ({error})", cure=cure) from error

@@ -1,4 +1,4 @@
-"""Write files so that a reader sees the old content or the new one, never half of it."""
+"""This module writes files so that a reader sees either the old or the new content, never a part."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from directshape_torch.errors import InputError
 
 
 def write_bytes(path: Path | str, content: bytes, durable: bool = False) -> None:
-    """Write `content` to `path` by way of a temporary file in the same folder, which is made where it is missing.
+    """Write `content` to `path` through a temporary file in the same folder, which is created if it is missing.
 
     Args:
-        path: the file to make or replace.
+        path: the file to create or replace.
         content: its bytes.
-        durable: wait for the disk, so that not even a power cut leaves a file of another length.
+        durable: whether to wait for the disk, so that even a power failure leaves no file of another length.
 
     Examples:
         >>> import tempfile
@@ -39,16 +39,16 @@ def write_bytes(path: Path | str, content: bytes, durable: bool = False) -> None
 
 @contextmanager
 def replaced_file(path: Path | str) -> Iterator[IO[bytes]]:
-    """A file that takes the place of `path` when the body ends, and leaves it alone when the body fails.
+    """A temporary file that replaces `path` at the end of the body, or is removed if the body fails.
 
-    Its folder is made where it is missing. A link of that name is replaced and not followed.
+    The folder is created if it is missing. A link with this name is replaced and not followed.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.urandom(6).hex()}.tmp")
     try:
-        # Readable like any new file: `tempfile` makes them for their owner alone, and asking for the process's mask of
-        # permissions would set it.
+        # The file gets the permissions of any new file. `tempfile` would restrict it to its owner, and reading the
+        # process's permission mask would change the mask.
         with open(temporary, "xb") as file:
             yield file
         os.replace(temporary, path)
@@ -58,7 +58,7 @@ def replaced_file(path: Path | str) -> Iterator[IO[bytes]]:
 
 
 def check_folder(name: str, path: Path) -> None:
-    """Raise `InputError` where a folder cannot be made, for a file or broken link has its name or one above it."""
+    """Raise `InputError` if a folder cannot be created, because a file or broken link is in its path."""
     existing = next(each for each in (path, *path.parents) if each.exists() or each.is_symlink())
     if not existing.is_dir():
         kind = "file" if existing.exists() else "broken link"
@@ -66,19 +66,19 @@ def check_folder(name: str, path: Path) -> None:
 
 
 def check_file(name: str, path: Path) -> None:
-    """Raise `InputError` where a file cannot be written, for its folder cannot be made or a folder has its name."""
+    """Raise `InputError` if a file cannot be written, because its folder cannot be created or `path` is a folder."""
     check_folder(name, path.parent)
     if path.is_dir():
         raise InputError(name, "a file", f"the folder {path}")
 
 
 def write_text(path: Path | str, text: str) -> None:
-    """Write `text` as UTF-8, line ends as they are, like `write_bytes`."""
+    """Write `text` as UTF-8 with unchanged line ends, like `write_bytes`."""
     write_bytes(path, text.encode("utf-8"))
 
 
 def write_json(path: Path | str, value: Any, durable: bool = False) -> None:
-    """Write `value` as JSON with sorted keys and a final newline; NaN and infinity are refused, JSON has none."""
+    """Write `value` as JSON with sorted keys and a final newline; NaN and infinity raise, since JSON has none."""
     text = json.dumps(value, indent=2, sort_keys=True, allow_nan=False) + "\n"
     write_bytes(path, text.encode("utf-8"), durable)
 

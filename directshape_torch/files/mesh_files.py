@@ -1,4 +1,4 @@
-"""Read triangle meshes of bounded size, by trimesh, from one file each: no textures, no files that it refers to."""
+"""This module reads triangle meshes of limited size with trimesh, without textures or other referenced files."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from directshape_torch.errors import DataFormatError, shown
 from directshape_torch.files.read_files import read_bytes
 
-# glTF demands y up and the viewer in front of +z; the camera has y down and looks along +z.
+# glTF has y up and the viewer in front of +z; the camera has y down and looks along +z.
 T_GLTF_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".off", ".stl")
-# trimesh needs up to a hundred bytes for one of a text.
+# trimesh needs up to a hundred bytes of memory for each byte of text.
 _MOST_BYTES = 2**28
 _MOST_LINES = 2**23
 _MOST_HEADER_BYTES = 2**25
-# What a glTF file refers to over and over is copied for each time.
+# trimesh copies data each time that a glTF file refers to it.
 _MOST_COPIED_BYTES = 2**29
 _MOST_CORNERS = 2**25
 _MOST_PARTS = 2**14
@@ -33,8 +33,8 @@ def read_mesh(path: Path | str, cure: str = "") -> tuple[NDArray[np.float64], ND
     r"""Vertices (V, 3) and triangles (F, 3) of an obj, ply, glb, off or stl file, all its parts in one.
 
     Raises:
-        DataFormatError: no such file, none of these formats, damaged, too large (256 MiB, 8 million lines; glb: what
-            its parts come to), or without triangles of finite vertices.
+        DataFormatError: the file is missing, has none of these formats, is damaged or too large (256 MiB, 8 million
+            lines; for glb the sum of its parts), or has no triangles with finite vertices.
 
     Examples:
         >>> import tempfile
@@ -51,10 +51,10 @@ def read_mesh(path: Path | str, cure: str = "") -> tuple[NDArray[np.float64], ND
     content = read_bytes(path, _MOST_BYTES)
     try:
         _check_parts(content) if suffix == ".glb" else _check_lines(content)
-        # From memory and without a folder, so that it cannot open other files.
+        # The mesh is loaded from memory and without a folder, so that it cannot open other files.
         mesh = trimesh.load_mesh(io.BytesIO(content), suffix[1:], process=False, skip_materials=True)
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    # The loaders of the formats raise whatever their parsers raise.
+    # The loaders of the formats raise any error of their parsers.
     except Exception as problem:
         said = f"cannot be read as a mesh ({type(problem).__name__}: {problem})"
         raise DataFormatError(path, said, cure=cure) from problem
@@ -71,7 +71,7 @@ def _check_lines(content: bytes) -> None:
 
 
 def _check_parts(content: bytes) -> None:
-    """Raise `ValueError` where a glb file asks for more than its bytes justify."""
+    """Raise `ValueError` if a glb file needs more memory than its size justifies."""
     (length,) = struct.unpack_from("<I", content, 12)
     _at_most(_MOST_HEADER_BYTES, "bytes of description", length)
     header = json.loads(content[20 : 20 + length])
@@ -88,7 +88,7 @@ def _check_parts(content: bytes) -> None:
 
 
 def _corners(part: Mapping[str, Any], accessors: list[Any]) -> int:
-    """Vertices and corners of triangles."""
+    """Number of vertices and triangle corners of a part."""
     used = [part["attributes"]["POSITION"], *([part["indices"]] if "indices" in part else [])]
     return sum(_size(accessors[each], "count") for each in used)
 

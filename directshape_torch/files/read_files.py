@@ -1,7 +1,7 @@
-"""Open what a user names: regular files only, of bounded size, with errors that name file and line.
+"""This module opens files that a user names: regular files of limited size, with errors that name file and line.
 
-Whatever comes may be hostile: sizes and numbers are checked before a decoder allocates anything for them, and no object
-is ever unpickled.
+Files may be hostile, so sizes and numbers are checked before a decoder allocates memory for them, and nothing is
+unpickled.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ from numpy.typing import NDArray
 from directshape_torch.errors import DataFormatError, shown
 
 MOST_BYTES = 2**29
-"""Of one file, and of what it unpacks to."""
+"""This is the limit for one file, and for its unpacked content."""
 
-# A line of one letter takes two hundred bytes once it is numbered.
+# A numbered line of one letter takes two hundred bytes.
 _MOST_TEXT_BYTES = 2**24
-# Parsed JSON takes some twenty times its size.
+# Parsed JSON takes about twenty times its size.
 _MOST_JSON_BYTES = 2**28
 _MOST_DIGITS = 18
-# The marks of UTF-32 are looked for first, for one of them begins with a mark of UTF-16.
+# UTF-32 is checked first, because one of its marks begins with a mark of UTF-16.
 _MARKS = {
     **dict.fromkeys((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE), "utf-32"),
     **dict.fromkeys((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE), "utf-16"),
 }
-# Lines end as on Unix, on Windows (whose other half stays, so that lines are copied as they are) or on old Macs.
+# Lines end as on Unix, on Windows (where \r stays in the line, so that lines are copied unchanged) or on old Macs.
 _LINE_END = re.compile(r"\n|\r(?!\n)")
-# What is left of the 255 that file systems take belongs to endings and to the names of temporary files.
+# File systems allow 255 bytes; the rest is for endings and for the names of temporary files.
 _MOST_NAME_BYTES = 200
 _T = TypeVar("_T")
 
 
 def is_frame_id(frame_id: object) -> bool:
-    """Whether a frame's name can be that of its files, and is no path.
+    """Whether a frame's name can be used in file names and is not a path.
 
     Examples:
         >>> is_frame_id("000107"), is_frame_id("/etc/passwd"), is_frame_id("..")
@@ -61,10 +61,11 @@ def is_frame_id(frame_id: object) -> bool:
 
 
 def read_bytes(path: Path | str, most: int = MOST_BYTES, cure: str = "check the path") -> bytes:
-    """The content of a regular file of at most that many bytes; links are followed.
+    """The content of a regular file of at most `most` bytes; links are followed.
 
     Raises:
-        DataFormatError: it is missing, cannot be read, is a folder, a pipe or a device, or too large; with the cure.
+        DataFormatError: the file is missing, unreadable, a folder, a pipe, a device, or too large; the error has the
+            cure.
 
     Examples:
         >>> read_bytes("/dev/zero")
@@ -72,7 +73,7 @@ def read_bytes(path: Path | str, most: int = MOST_BYTES, cure: str = "check the 
         ...
         directshape_torch.errors.DataFormatError: /dev/zero: is no regular file; check the path
     """
-    if not isinstance(path, (str, os.PathLike)):  # the number of an open file would do for Python
+    if not isinstance(path, (str, os.PathLike)):  # Python would accept the number of an open file
         raise DataFormatError(shown(path), "is no path", cure=cure)
     try:
         with open(path, "rb", opener=_open_at_once) as file:
@@ -87,20 +88,20 @@ def read_bytes(path: Path | str, most: int = MOST_BYTES, cure: str = "check the 
     except ValueError as error:
         if isinstance(error, DataFormatError):
             raise
-        # A NUL, or letters that no file system takes.
+        # The path has a NUL, or characters that file systems do not accept.
         raise DataFormatError(repr(str(path)), f"is no path ({error})", cure=cure) from error
 
 
 def _open_at_once(path: str, flags: int) -> int:
-    """Without waiting, as a pipe would make us until somebody writes to it."""
+    """Open a file without blocking, as a pipe would until a process writes to it."""
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def read_text(path: Path | str, most: int = _MOST_TEXT_BYTES, cure: str = "check the path") -> str:
-    """The content of a text file in UTF-8, or in UTF-16 or UTF-32 where it begins with the mark of that.
+    """The content of a text file in UTF-8, or in UTF-16 or UTF-32 if it begins with their mark.
 
-    PowerShell and Excel begin texts with such a mark, which is left out. Raises like `read_bytes`, and where it is no
-    such text.
+    PowerShell and Excel write such a mark, which is removed. Errors are those of `read_bytes`, and a `DataFormatError`
+    for other content.
     """
     content = read_bytes(path, most, cure)
     encoding = next((encoding for mark, encoding in _MARKS.items() if content.startswith(mark)), "utf-8-sig")
@@ -112,10 +113,12 @@ def read_text(path: Path | str, most: int = _MOST_TEXT_BYTES, cure: str = "check
 
 
 def remembered(read: Callable[[Path], _T]) -> Callable[[Path | str], _T]:
-    """What `read` makes of a file, kept while its size and time of change stay the same: for files that serve many
-    frames. Whoever gets it leaves it as it is."""
+    """A version of `read` with a cache, which is valid while size and time of change of the file stay the same.
 
-    # With the state of the file, which is looked at only as a key.
+    It is for files that serve many frames. Callers must not modify the result.
+    """
+
+    # The state of the file is used only as a key of the cache.
     @lru_cache(maxsize=256)
     def in_state(path: Path, _size_bytes: int, _changed_ns: int) -> _T:
         return read(path)
@@ -133,19 +136,19 @@ def remembered(read: Callable[[Path], _T]) -> Callable[[Path | str], _T]:
 
 @dataclass(frozen=True)
 class Line:
-    """One line: its number from 1, its text without outer white space, and all of it but the newline."""
+    """A `Line` has its number from 1, its text without outer white space, and the raw text without the newline."""
 
     number: int
     text: str
     raw: str
 
     def error(self, path: Path | str, problem: str, cure: str = "") -> DataFormatError:
-        """A complaint about the line that names it."""
+        """An error about the line that names it."""
         return DataFormatError(path, problem, line_number=self.number, line=self.text, cure=cure)
 
 
 def read_lines(path: Path | str) -> list[Line]:
-    """The lines of a text file that are not blank; raises like `read_text`."""
+    """The lines of a text file that are not blank; errors are those of `read_text`."""
     lines = (Line(number, raw.strip(), raw) for number, raw in enumerate(_LINE_END.split(read_text(path)), start=1))
     return [line for line in lines if line.text]
 
@@ -156,7 +159,7 @@ def finite_numbers(
     """The numbers (count,) of a line, or of its last words.
 
     Raises:
-        DataFormatError: it holds something else, or not as many; names file and line.
+        DataFormatError: the line has another content or number of words; the error names file and line.
 
     Examples:
         >>> finite_numbers("calib.txt", Line(3, "1 2.5", "1 2.5"), 2)
@@ -182,16 +185,16 @@ def _finite(word: str) -> float | None:
 
 
 def read_json(path: Path | str, cure: str = "") -> Any:
-    """The value in a JSON file; raises like `read_bytes` and `parse_json`."""
+    """The value in a JSON file; errors are those of `read_bytes` and `parse_json`."""
     return parse_json(path, read_bytes(path, _MOST_JSON_BYTES), cure)
 
 
 def parse_json(path: Path | str, text: str | bytes, cure: str = "", problem: str = "is not valid JSON") -> Any:
-    """The value of a JSON text that stands in the file `path`.
+    """The value of a JSON text from the file `path`.
 
     Raises:
-        DataFormatError: it is no JSON, nested too deeply, or holds a number that is not finite or has more than 18
-            digits before its point; with the problem and the cure.
+        DataFormatError: the text is not JSON, is nested too deeply, or has a number that is not finite or has more than
+            18 digits before its point; the error has the problem and the cure.
 
     Examples:
         >>> parse_json("a.json", "[1, 1e999]")

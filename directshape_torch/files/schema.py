@@ -1,4 +1,4 @@
-"""Whether what came from a JSON file is what a type says."""
+"""This module checks whether JSON content has the types of a dataclass or another type hint."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ def record_of(path: Path | str, cls: type[_RecordT], content: Any, cure: str = "
     """A dataclass of plain values, lists and mappings from a JSON object that holds its fields.
 
     Args:
-        path, cure: for the message.
+        path, cure: parts of the message.
         cls: the dataclass.
         content: the object.
-        where: in the file, before the name of a field, such as "objects[0].".
+        where: place in the file, before the name of a field, such as "objects[0].".
 
     Examples:
         >>> from directshape_torch.batch.run_log import RunEvent
@@ -46,7 +46,7 @@ def record_of(path: Path | str, cls: type[_RecordT], content: Any, cure: str = "
 
 
 def check_type(path: Path | str, where: str, value: Any, hint: Any, cure: str = "") -> None:
-    """Raise `DataFormatError` where a value, or one within it, is not of its type."""
+    """Raise `DataFormatError` if a value, or one within it, does not have its type."""
     for place, wrong, expected in _misfits(where, value, hint):
         raise DataFormatError(path, f"{place}: expected {_words(expected)}, got {shown(wrong)}", cure=cure)
 
@@ -65,7 +65,7 @@ def _words(hint: Any) -> str:
 
 
 def _misfits(where: str, value: Any, hint: Any) -> Iterator[tuple[str, Any, Any]]:
-    """Place, value and type of whatever does not fit."""
+    """Place, value and expected type of every value that does not fit."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any:
         return
