@@ -1,4 +1,4 @@
-// One car in full: pictures, residual maps, figures, costs by term and the profile over disparity.
+// This module shows one car in full: pictures, residual maps, figures, costs by term and the disparity profile.
 
 import { element } from "report/dom";
 import { mapsOf, thumbnailsOf } from "report/data";

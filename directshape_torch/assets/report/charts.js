@@ -1,4 +1,4 @@
-// Distributions as plain SVG: histograms of two series, bars of counts, and curves.
+// This module draws distributions as SVG: histograms of two series, bars of counts, and curves.
 
 import { element, svg, byId } from "report/dom";
 import { cars, run, hasLabels } from "report/data";
@@ -36,7 +36,7 @@ const KEYS = [["before", "before"], ["after", "after"]];
 function histogram(title, rows, first, second, low, high, unit, keys = KEYS, stacked = false) {
   const series = [first, second].map((name) => rows.map((row) => row[name]).filter((value) => value !== null));
   const all = series.flat().sort((a, b) => a - b);
-  // Of many the few far-off ones go to the last bar, which says so.
+  // A few far outliers among many values are counted in the last bar, which says so.
   const top = high ?? niceCeiling(all[Math.ceil(0.97 * (all.length - 1))] ?? 1);
   const open = (all[all.length - 1] ?? 0) > top;
   const counts = series.map((values) => binned(values, low, top, 14));
@@ -44,7 +44,7 @@ function histogram(title, rows, first, second, low, high, unit, keys = KEYS, sta
     drawnBars(counts, keys, low, top, open, stacked), describe(title, unit, keys, series));
 }
 
-// Losses to the left of 0 and red, gains to the right.
+// The histogram has losses in red to the left of 0, and gains to the right.
 function changes(values) {
   if (!values.length) return "";
   const most = niceCeiling(Math.max(...values.map(Math.abs)));
@@ -115,7 +115,7 @@ function bars(title, entries) {
   return figure(title, "", [], chart, `${title}: ${entries.map(([name, count]) => `${name} ${count}`).join(", ")}`);
 }
 
-// Curves over common positions, as [class, values] pairs; gaps where a value is missing.
+// Curves over common positions are [class, values] pairs; a missing value leaves a gap.
 export function curves(title, unit, positions, series) {
   const known = series.flatMap(([, values]) => values).filter((value) => value !== null);
   if (!known.length) return null;

@@ -1,4 +1,4 @@
-// The data that the page carries. Details of a frame are parsed when they are first asked for.
+// This module reads the data in the page. Details of a frame are parsed on first use.
 
 import { byId } from "report/dom";
 
@@ -18,7 +18,7 @@ export const frames = read("frames");
 const table = read("cars");
 const countInFrame = new Map();
 
-// Each car as an object; `place` is its number in the details of its frame.
+// Each car is an object; `place` is its index in the details of its frame.
 export const cars = table.rows.map((values, index) => {
   const car = Object.fromEntries(table.columns.map((name, column) => [name, values[column]]));
   const place = countInFrame.get(car.frame) ?? 0;
@@ -31,7 +31,7 @@ export const tracks = [...new Set(cars.map((car) => car.track).filter(Boolean))]
 export const hasErrorsBefore = cars.some((car) => car.iou_before !== null);
 
 export const carsOfFrame = (frame) => cars.filter((car) => car.frame === frame);
-// Where a car of a track is in each of its frames, as the camera sees it.
+// Returns the positions of a car in all frames of its track, in camera coordinates.
 export const pathOf = (car) => cars.filter((other) => car.track && other.track === car.track).map((view) => [view.x_m, view.y_m, view.distance_m]);
 export const thumbnailsOf = (car) => read(`thumbnails-${car.frame}`)?.[car.place] ?? {};
 export const mapsOf = (car) => read(`maps-${car.frame}`)?.[car.place] ?? null;

@@ -1,4 +1,4 @@
-// Elements are made here and nowhere else. Text is set as text: names from files never become markup.
+// This module creates all elements. Text is set as text, so that names from files never become markup.
 
 const SVG = "http://www.w3.org/2000/svg";
 

@@ -1,10 +1,10 @@
-// The left image of a frame with the boxes drawn over it.
+// This module draws the left image of a frame with boxes over it.
 
 import { svg } from "report/dom";
 import { carName, counted } from "report/format";
 
 const NEAR_M = 0.3;
-// The edges of a box in the order of `box_corners`, and the line to its front.
+// These are the edges of a box in the order of `box_corners`, and the line to its front.
 export const EDGES = [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]];
 
 export function framePicture(scene, cars, shown, open) {
@@ -39,7 +39,7 @@ function clipped(a, b) {
   return [cut(a, b), cut(b, a)];
 }
 
-// Pixel centres are whole numbers in K; in SVG the centre of the first pixel is at one half.
+// Pixel centres are whole numbers for K; in SVG the centre of the first pixel is at one half.
 function project([x, y, z], K) {
   return [(K[0] * x + K[1] * y + K[2] * z) / z + 0.5, (K[4] * y + K[5] * z) / z + 0.5].map((u) => Math.max(-1e4, Math.min(1e4, u)));
 }

@@ -1,4 +1,4 @@
-// One frame at a time: its picture, and its cars in 3D.
+// This module shows one frame at a time: its picture, and its cars in 3D.
 
 import { element, byId } from "report/dom";
 import { carsOfFrame, frames, pathOf, sceneOf, tracks } from "report/data";
@@ -15,7 +15,7 @@ let openCar = null;
 let viewer = null;
 let started = null;
 
-// `open` shows a car in full; the dialog itself needs this module.
+// `open` shows a car in full; it is set later, because the dialog itself needs this module.
 export function showFrames(open) {
   openCar = open;
   const place = byId("frames");
@@ -25,7 +25,7 @@ export function showFrames(open) {
   }
   choice.append(...frames.detailed.map((number) => element("option", { value: number }, frames.ids[number])));
   place.append(controls(), caption, element("div", { class: "frame-stage" }, picture, host), viewControls());
-  // The viewer is started when it comes near, not with the page.
+  // The viewer starts when it is scrolled near the window, not with the page.
   new IntersectionObserver((entries, observer) => {
     if (!entries.some((entry) => entry.isIntersecting)) return;
     observer.disconnect();
@@ -52,7 +52,7 @@ function viewControls() {
     element("span", { class: "quiet" }, "Drag to turn, wheel or pinch to come nearer, right button or two fingers to move; arrow keys move, with Shift they turn. Select a car to open it."));
 }
 
-// Whoever asks first starts the viewer; the others wait for the same one.
+// The first caller starts the viewer; later callers wait for the same one.
 const startViewer = () => started ??= start();
 
 async function start() {
@@ -80,7 +80,7 @@ async function showFrame(number) {
   if (current === number) viewer?.lookFrom("behind");
 }
 
-// Resolves when the 3D view has caught up.
+// The promise resolves when the 3D view is up to date.
 function redraw() {
   const scene = sceneOf(current), inFrame = carsOfFrame(current);
   picture.replaceChildren(scene.image === null

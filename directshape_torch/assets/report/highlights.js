@@ -1,4 +1,4 @@
-// The cars that gained most and least.
+// This module shows the cars that gained most and least.
 
 import { element, byId } from "report/dom";
 import { cars, hasErrorsBefore } from "report/data";

@@ -1,4 +1,4 @@
-// The page, section by section.
+// This module builds the page, section by section.
 
 import { showSummary } from "report/summary";
 import { showDistributions } from "report/charts";

@@ -1,4 +1,4 @@
-// Meshes as mesh_data.py packs them: whole numbers less the one before, deflated, base64.
+// This module unpacks meshes of `mesh_data` in page_parts.py: differences of whole numbers, zlib, base64.
 
 const PER_METRE = 1000;
 

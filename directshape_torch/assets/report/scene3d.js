@@ -1,5 +1,5 @@
-// The cars of a frame in 3D: surfaces, boxes before and after, labels, ground. Axes of the left camera, turned so that
-// up is up. Nothing is drawn while nothing moves.
+// This module shows the cars of a frame in 3D: surfaces, boxes before and after, labels, ground. Axes are those of the
+// left camera, rotated to y up. The scene is drawn only when something changes.
 
 import * as THREE from "three";
 import { OrbitControls } from "three/orbit-controls";
@@ -8,7 +8,7 @@ import { counted } from "report/format";
 import { readMesh } from "report/mesh";
 import { EDGES } from "report/frame_picture";
 
-// Pale, so that none is taken for the lines before, after and of the truth.
+// The colours are pale, so that they differ from the lines before, after and of the truth.
 const PAINTS = [0x9db4cf, 0xcfb79a, 0xa5bf9f, 0xc3a4bd, 0xcac39a, 0xabb3bb];
 const COLOURS = { before: 0xff9f1a, after: 0x3aa0ff, truth: 0x35c258 };
 
@@ -40,7 +40,7 @@ export class Viewer {
     let start = null;
     this.canvas.addEventListener("pointerdown", (event) => { start = [event.clientX, event.clientY]; });
     this.canvas.addEventListener("pointerup", (event) => {
-      // A drag turns the view; only a click that stays in its place opens a car.
+      // A drag rotates the view; only a click without movement opens a car.
       if (start === null || Math.hypot(event.clientX - start[0], event.clientY - start[1]) > 4) return;
       const place = this.carUnder(event);
       if (place !== null) openCar(place);
@@ -49,17 +49,17 @@ export class Viewer {
     window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { this.paintGround(); this.draw(); });
   }
 
-  // `paints` are numbers of colours, `paths` places [x, y, z] of each car in all frames of its track.
+  // `paints` are indices of colours, `paths` positions [x, y, z] of each car in all frames of its track.
   async show(data, shown, label, paints, paths) {
     const generation = ++this.generation;
     const meshes = await Promise.all(data.cars.map((car) => surfaceOf(car)));
-    if (generation !== this.generation) return;  // another frame was chosen meanwhile
+    if (generation !== this.generation) return;  // another frame was chosen in the meantime
     const isFirst = this.data === undefined;
     this.data = data;
     this.canvas.setAttribute("aria-label", `${label}: ${counted(data.cars.length, "car")}`);
     release(this.cars);
     this.cars = new THREE.Group();
-    // The camera's y points down and its z forward; here up is +y.
+    // The camera has y down and z forward; the scene has y up.
     this.cars.rotation.x = Math.PI;
     data.cars.forEach((car, place) => this.addCar(car, place, meshes[place], shown, PAINTS[paints[place] % PAINTS.length]));
     if (shown.after) paths.forEach((path, place) => this.cars.add(pathLine(path, PAINTS[paints[place] % PAINTS.length])));
@@ -110,9 +110,9 @@ export class Viewer {
   lookFrom(name) {
     if (this.data === undefined) return;
     const depths = this.data.cars.map((car) => boxCentre(car.box_after)[2]).sort((a, b) => a - b);
-    // Where the nearest car is far, the view starts nearer to it.
+    // If the nearest car is far, the view starts nearer to it.
     const ahead = Math.max(0, (depths[0] ?? 0) - 12);
-    // A narrow canvas sees less to the sides: it stands farther back.
+    // The camera is farther back for a narrow canvas, which shows less at the sides.
     const back = Math.max(1, 1.5 / this.camera.aspect);
     const slope = Math.tan(0.5 * this.camera.fov * Math.PI / 180);
     const { far, side } = this.reach;
@@ -186,7 +186,7 @@ function boxLines(box, colour) {
   return lines([...EDGES.flatMap(([a, b]) => [...corner(a), ...corner(b)]), ...middle, ...front], colour);
 }
 
-// From each place to the next, with a cross at each.
+// The path connects consecutive positions and has a cross at each.
 function pathLine(path, colour) {
   const ways = path.slice(1).flatMap((place, index) => [...path[index], ...place]);
   const crosses = path.flatMap(([x, y, z]) => [x - 0.2, y, z, x + 0.2, y, z, x, y, z - 0.2, x, y, z + 0.2]);

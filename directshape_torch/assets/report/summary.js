@@ -1,4 +1,4 @@
-// The top of the page: counts, mean errors, notes, failed frames, settings.
+// This module shows the top of the page: counts, mean errors, notes, failed frames, settings.
 
 import { element, byId } from "report/dom";
 import { cars, run, tracks } from "report/data";

@@ -1,4 +1,4 @@
-// All cars: filter, sort by any column, a hundred rows at a time.
+// This module shows all cars, with a filter and sorting by any column, a hundred rows at a time.
 
 import { element, byId } from "report/dom";
 import { cars, run, hasLabels, hasErrorsBefore, tracks } from "report/data";
@@ -12,7 +12,7 @@ const numeric = (title, value, text = (car) => number(value(car)), toneOf = () =
 const words = (title, value, kind = "words") => ({ title, value, text: value, kind });
 
 const iouTone = (car) => tone(car.iou_before, car.iou_after, true);
-// The frame's name says of which sequence.
+// The name of the frame contains the sequence.
 const trackNumber = (car) => trackName(car).replace(/^(.*_)?0*(?=\d)/, "");
 const columns = [
   ...(tracks.length ? [{ title: "Track", value: (car) => car.track, text: trackNumber, kind: "type" }] : []),
@@ -60,7 +60,7 @@ function controls() {
     element("label", { class: "narrow" }, "Sort by", sortChoice()));
 }
 
-// The table's head has no room on a phone.
+// The head of the table is too wide for a phone.
 function sortChoice() {
   const options = [nameColumn, ...columns].map((column, index) => element("option", { value: index }, column.title));
   return element("select", { id: "sort-choice", onchange: (event) => sortBy([nameColumn, ...columns][Number(event.target.value)]) }, ...options);
@@ -80,7 +80,7 @@ function head(column) {
 }
 
 function sortBy(column) {
-  // A first click on numbers shows the largest first, on words the alphabet.
+  // The first click sorts numbers from the largest and words by the alphabet.
   state.descending = state.column === column ? !state.descending : column.kind === "number";
   state.column = column;
   for (const [other, { cell, arrow }] of heads) {
@@ -97,7 +97,7 @@ function chosenCars() {
   return state.column === null ? found : found.sort((a, b) => compare(state.column.value(a), state.column.value(b)) || a.index - b.index);
 }
 
-// What is not known comes last, whichever way the rest is sorted.
+// Unknown values come last in both orders.
 function compare(a, b) {
   if (a === null || b === null) return (a === null) - (b === null);
   const order = typeof a === "string" ? a.localeCompare(b, "en", { numeric: true }) : a - b;

@@ -1,4 +1,4 @@
-// Small pictures of cars, made when they come into view.
+// This module shows small pictures of cars, created when they come into view.
 
 import { element } from "report/dom";
 import { thumbnailsOf } from "report/data";
@@ -15,7 +15,7 @@ const observer = new IntersectionObserver((entries) => {
   }
 }, { rootMargin: "300px" });
 
-// The picture of a car "before" or "after"; `whenMissing` is called where there is none.
+// Creates the picture of a car "before" or "after"; `whenMissing` is called if there is none.
 export function thumbnail(car, name) {
   const words = name === "before" ? "before, the detection with the mean shape" : "after the refinement";
   const image = element("img", { class: "thumbnail", alt: `Car ${carName(car)} ${words}`, decoding: "async", width: 110, height: 73 });
