@@ -1,11 +1,11 @@
-"""How long refinements take, of how many operations they are made, and how that compares (docs/performance.md).
+"""This script measures times and numbers of operations of refinements (docs/performance.md).
 
     python scripts/benchmark.py                                  # times, operations, memory of whole calls
     python scripts/benchmark.py --profile                        # one eager refinement, by part
     python scripts/benchmark.py --against ../other_checkout      # times and operations of this version over another's
 
-Frames come from DIRECTSHAPE_DATA (or --data), else from the bundled demo frame. A graphics card is taken where there is
-one; then it is also told how often it agrees with the CPU.
+Frames come from DIRECTSHAPE_DATA (or --data), else from the bundled demo frame. A graphics card is used if there is
+one; then its agreement with the CPU is measured too.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> None:
     """Measure and print.
 
     Raises:
-        InputError: no such data, device or checkout.
+        InputError: the data, device or checkout does not exist.
     """
     if args.threads is not None:
         if args.threads < 1:
@@ -66,7 +66,7 @@ def show(rows: Sequence[Row]) -> None:
 
 
 def machine(device: torch.device) -> str:
-    """What this runs on, in a line."""
+    """The machine and the versions, in one line."""
     listing = Path("/proc/cpuinfo")  # Linux hides the model's name from `platform`
     lines = listing.read_text(encoding="utf-8").splitlines() if listing.is_file() else []
     names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
@@ -77,7 +77,7 @@ def machine(device: torch.device) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse the command line and run; returns the exit code."""
+    """Parse the command line and run; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--profile", action="store_true", help="time and operations of one eager refinement by part")
     parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="this version over another one, in turn")

@@ -1,9 +1,9 @@
-"""Make `directshape_torch/assets/car_prior.safetensors`: principal components of a few hundred parametric cars.
+"""This script makes `directshape_torch/assets/car_prior.safetensors` from a few hundred parametric cars.
 
     python scripts/build_bundled_prior.py [--num-cars 600 --num-codes 8 --out PATH]
 
-No mesh goes in: every car comes from `parametric_cars`. The ranges of its measures were
-adjusted by hand while looking at how the prior fits real car meshes.
+The prior has the principal components of cars from `parametric_cars` and uses no meshes. The ranges of their measures
+were adjusted by hand to how the prior fits real car meshes.
 """
 
 from __future__ import annotations

@@ -1,15 +1,16 @@
-"""Measures what refined boxes are off by and when a car is there, and judges both where they were not fitted.
+"""This script fits the trust model: the errors of refined boxes and the probability that a car is there.
 
     D=$DIRECTSHAPE_DATA; K=$D/kitti15; M=$K/training/masks
     python scripts/calibrate_trust.py --cars $K stereo $M --cars $K $K/detections/pointrcnn $M --cars .. --out out/trust
 
-DETECTIONS are a folder of result files, or `stereo` or `mono`: a detector that is simulated from labels, ten times.
-A run learns what its detector is off by from its own results, never from labels. Labels tell what the images are off by
-and, beside boxes and masks that are laid on other images, when a car is there; each draw counts as much as another.
+DETECTIONS are a folder of result files, or `stereo` or `mono` for a detector that is simulated from labels, ten times.
+A run learns the errors of its detector from its own results, never from labels. Labels give the errors of the images,
+and, together with boxes and masks on unrelated images, when a car is there; all draws have the same weight. If all runs
+have other roots (by the names of their folders) with other detectors, each run is judged by a model that was fitted to
+these. Cars that the package refuses for lack of evidence are excluded.
 Boxes with the mask of their neighbour in the image are judged, too, but nothing is fitted to them.
-Each run is judged by what other roots (by the names of their folders) with other detectors have told, where all runs
-have such; cars that the package refuses for want of evidence take no part.
-Written to OUT: the draws, `report.md`, and `trust_model.json`, fitted to all.
+
+The draws, `report.md` and `trust_model.json`, fitted to all runs, are written to OUT.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ _TO_SIGMA = 1 / 0.7407  # the median of |x| of Student's t of 4 degrees of freed
 
 
 def runs_of(args: argparse.Namespace) -> list[Cars]:
-    """The refined cars of all runs, two at a time."""
+    """The refined cars of all runs, two runs at a time."""
     wanted = []
     for root, detections, masks in args.cars:
         if detections not in SIMULATED:
@@ -64,7 +65,7 @@ def runs_of(args: argparse.Namespace) -> list[Cars]:
 
 
 def _refined(run: tuple[Path, Path, Path, str, bool], overrides: Sequence[str], by_frame: bool) -> bytes:
-    """The cars of a run, in one piece: tensors by themselves would each take an open file with them."""
+    """Pickled cars of a run; as single tensors each would need an open file to cross processes."""
     root, detections, masks, name, with_wrong = run
     found = refined_cars(root, detections, masks, name, overrides, with_wrong and not by_frame, by_frame)
     count = sum(len(frame.result) for frame in found.frames)
@@ -73,7 +74,7 @@ def _refined(run: tuple[Path, Path, Path, str, bool], overrides: Sequence[str], 
 
 
 def fitted(runs: Sequence[Cars]) -> TrustModel:
-    """The model of some runs."""
+    """The model that fits the given runs."""
     noise = fit_noise(runs)
     there, not_there = evidence_of(runs, noise)
     head = fit_head(there, not_there) if len(not_there) else bundled_trust_model().car_is_there
@@ -87,7 +88,7 @@ def fitted(runs: Sequence[Cars]) -> TrustModel:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Refine, fit, judge, write."""
+    """Refine, fit, judge and write."""
     args.out.mkdir(parents=True, exist_ok=True)
     runs = [run for run in runs_of(args) if run.frames]
     rows = list(dict.fromkeys((run.root, run.detector) for run in runs))
@@ -118,7 +119,7 @@ def others_of(runs: Sequence[Cars], row: tuple[str, str]) -> list[Cars]:
 
 
 class JudgedRow(NamedTuple):
-    """The runs of one detector on one root, one a draw, as a model sees them."""
+    """A `JudgedRow` has the runs of one detector on one root, one for each draw, judged by a model."""
 
     cars: list[Judged]
     elsewhere: list[Judged]
@@ -126,17 +127,17 @@ class JudgedRow(NamedTuple):
     model: TrustModel
 
     def returned(self, cars: list[Judged], limits: AcceptanceConfig) -> list[NDArray[np.bool_]]:
-        """Which boxes of some runs of the row come back, run by run."""
+        """Whether the boxes of some runs of the row are returned, run by run."""
         return [returned(each, self.model.car_is_there, limits) for each in cars]
 
     def chosen(self, cars: list[Judged], limits: AcceptanceConfig) -> list[Array]:
-        """Overlaps of what comes back, run by run."""
+        """IoU of the boxes that are returned, run by run."""
         pairs = zip(self.returned(cars, limits), cars, strict=True)
         return [np.where(kept, each.after, each.before) for kept, each in pairs]
 
 
 Rows: TypeAlias = Mapping[tuple[str, str], JudgedRow]
-"""By root and detector."""
+"""The keys are root and detector."""
 
 
 def _judged(runs: Sequence[Cars], row: tuple[str, str], model: TrustModel) -> JudgedRow:
@@ -147,7 +148,7 @@ def _judged(runs: Sequence[Cars], row: tuple[str, str], model: TrustModel) -> Ju
 
 
 def _policies(rows: Rows, limits: AcceptanceConfig) -> str:
-    """What comes back, a row for each detector on each root: means over the draws, with their standard deviation."""
+    """Table of returned boxes, a row for each detector and root: means over draws with standard deviations."""
     head = "cars", "runs, cars", "input", "images alone (worse)", "most probable (worse)", "returned (worse, share)"
     wrong = "returned on other images", "returned worse with a neighbour's mask"
     lines = ["| " + " | ".join((*head, *wrong)) + " |", "|" + "---|" * 8]
@@ -169,7 +170,7 @@ def _count(flags: Sequence[NDArray[np.bool_]]) -> str:
 
 
 def _thresholds(rows: Rows, limits: AcceptanceConfig) -> str:
-    """What other limits of the probability of a box that is not worse would return."""
+    """Table of returned boxes for other limits of the probability of a box that is not worse."""
     head = f"better from {limits.min_probability_better:g}, not worse from", *(f"{least:g}" for least in THRESHOLDS)
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for (root, detector), row in rows.items():
@@ -192,7 +193,7 @@ def _spread(values: Sequence[float]) -> str:
 
 
 def _reliability(rows: Rows) -> str:
-    """Predicted beside true shares, in bins of the prediction."""
+    """Table of predicted and true shares, in bins of the prediction."""
     pairs = [
         (probabilities(cars, row.model.car_is_there), outcomes(cars)) for row in rows.values() for cars in row.cars
     ]
@@ -211,7 +212,7 @@ def _reliability(rows: Rows) -> str:
 
 
 def _coverage(rows: Rows) -> str:
-    """True errors over the standard deviations that are given, by their medians: 1 is right."""
+    """Table of median true errors divided by the given standard deviations; 1 is right."""
     lines = ["| true over given sigma | " + " | ".join(CAR_QUANTITIES[:4]) + " |", "|---|---|---|---|---|"]
     for (root, detector), row in rows.items():
         standard = np.concatenate([cars.standard for cars in row.cars])
@@ -230,7 +231,7 @@ def _noises(models: Mapping[str, TrustModel]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse the command line and run; returns the exit code."""
+    """Parse the command line and run; return the exit code."""
     torch.set_num_threads(1)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(

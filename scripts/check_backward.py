@@ -1,17 +1,17 @@
-"""Gradients through whole refinements against finite differences: every backward mode with every option.
+"""This script compares gradients through refinements with finite differences, in every mode with every option.
 
-Each input of a refinement is moved along one direction, and the sum of a car's outputs with fixed weights is
-differentiated twice: by the backward mode, and by central differences of the refinement itself, at two steps. Where the
-two steps disagree by more than 5 % the refinement is at a jump there, and the pair is left out and counted. An error is
-relative to the differences; a car to which a mode gives no gradient, with a warning, is left out and counted too.
+Each input of a refinement is moved along one direction, and the weighted sum of a car's outputs is differentiated
+twice: by the backward mode, and by central differences of the refinement itself, at two steps. If the two steps differ
+by more than 5 %, the refinement jumps there, and the pair is excluded and counted. Errors are relative to the
+differences. A car to which a mode gives no gradient, with a warning, is excluded and counted too.
 
-Cars are those of the bundled frame, as shipped but for their pixels, or two of a small drawn street whose iterations go
-on to the root of the gradient, as the implicit modes need it. All is float64.
+Cars are those of the bundled frame, unchanged except for fewer pixels, or two of a small drawn street whose iterations
+converge to the root of the gradient, as the implicit modes need. All values are float64.
 
     python scripts/check_backward.py --out backward
     python scripts/check_backward.py --scene street --option default "silhouette.form=product" --mode implicit
 
-Printed, and written as `backward.md`: what docs/gradients.md sums up.
+The table is printed and written as `backward.md`; docs/gradients.md summarises it.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ THINNED = (
     "acceptance.min_probability_better=0",
     "acceptance.min_probability_not_worse=0",
     "rig.disparity_sigma_px=0",
-    # What images and detector count for is a constant of the derivatives.
+    # The weights of images and detector are constants of the derivatives.
     "priors.detector_weight=0",
 )
-# What a row of the table changes in the default settings.
+# These are the changes of the default settings for each row of the table.
 OPTIONS: dict[str, tuple[str, ...]] = {
     "default": (),
     "brightness none": ("photometric.brightness=none",),
@@ -68,7 +68,7 @@ OPTIONS: dict[str, tuple[str, ...]] = {
     "geometric joint": ("method=geometric", "point_cloud.order=joint", "point_cloud.min_points=20"),
     "combined": ("method=combined", "point_cloud.min_points=20"),
 }
-# Undamped steps to the root of the gradient, on masks of few pixels.
+# These settings take undamped steps to the root of the gradient, on masks of few pixels.
 SETTLED = (
     "stages=[{contour_width_px: 2.0, image_level: 1, max_iterations: 10}, {contour_width_px: 1.0, image_level: 0, "
     "max_iterations: 40}]",
@@ -89,7 +89,7 @@ _KINK = 0.05
 
 @dataclass(frozen=True)
 class Scene:
-    """The cars, their settings but for the options, and the directions in which the inputs are moved."""
+    """A `Scene` has the cars, their settings without the options, and the directions in which inputs are moved."""
 
     frames: FrameBatch
     detections: Detections
@@ -115,7 +115,7 @@ class Scene:
 
     @classmethod
     def _of(cls, frames: FrameBatch, detections: Detections, prior: PCAShapePrior, settings: Sequence[str]) -> Scene:
-        """With standard deviations of the detector, and masks that are not clamped, which have no gradient."""
+        """A scene with standard deviations of the detector and unclamped masks, since clamping has no gradient."""
         sigma = detections.score.new_tensor([0.6, 0.2, 0.1, 0.1]).expand(len(detections), 4)
         left, right = (x.dense().clamp(0.1, 0.9) for x in (detections.mask_left, detections.mask_right))
         detections = replace(detections, pose_sigma=sigma, mask_left=left, mask_right=right)
@@ -131,7 +131,7 @@ INPUTS = (*BOX, "pose_sigma", "left image", "right image", "masks", "prior mean"
 
 
 def refined(scene: Scene, config: RefinerConfig, by: Mapping[str, Tensor]) -> RefinementResult:
-    """The result with inputs moved by `by[name]`: of the box (B,), else one number."""
+    """The result with inputs moved by `by[name]`, which is (B,) for the box, else one number."""
     frames, d = scene.frames, scene.detections
     at = {name: by.get(name, torch.zeros((), dtype=torch.float64)) for name in INPUTS}
     shift = torch.stack([at[name].expand(len(d)) for name in BOX], dim=1)
@@ -158,7 +158,7 @@ def refined(scene: Scene, config: RefinerConfig, by: Mapping[str, Tensor]) -> Re
 
 
 def outputs(result: RefinementResult) -> Tensor:
-    """One number (B,) of each car, that depends on its position, heading and shape."""
+    """One number (B,) for each car that depends on its position, heading and shape."""
     weight = torch.linspace(0.5, 1.0, result.code.shape[1], dtype=result.code.dtype)
     place = result.T_cam_obj[:, :3, 3].sum(dim=1) + 2 * rotation_y_from_pose(result.T_cam_obj)
     return place + 0.3 * (result.code * weight).sum(dim=1)
@@ -175,7 +175,7 @@ def differences(scene: Scene, config: RefinerConfig, step: float, inputs: Sequen
 
 
 def gradients(scene: Scene, config: RefinerConfig, inputs: Sequence[str] = INPUTS) -> Tensor:
-    """What the backward mode says of the same (inputs, B)."""
+    """Gradients (inputs, B) of the backward mode."""
     zero = torch.zeros((), dtype=torch.float64)
     by = {name: zero.clone().requires_grad_() for name in inputs}
     found = outputs(refined(scene, config, by))
@@ -188,7 +188,7 @@ def gradients(scene: Scene, config: RefinerConfig, inputs: Sequence[str] = INPUT
 
 @dataclass(frozen=True)
 class Row:
-    """An option: differences at two steps, each (inputs, B), and what the modes say, None where one refuses."""
+    """A `Row` has an option's differences at two steps, each (inputs, B), and gradients by mode, None if refused."""
 
     option: str
     numeric: Tensor
@@ -197,16 +197,16 @@ class Row:
 
     @property
     def smooth(self) -> Tensor:
-        """Where both differences agree (inputs, B)."""
+        """Whether both differences agree (inputs, B)."""
         scale = self.numeric.abs().maximum(self.numeric_smaller.abs())
         return (self.numeric - self.numeric_smaller).abs() <= _KINK * scale + 1e-7
 
     def errors(self, mode: str) -> str:
-        """Of the box and of the other inputs, of cars that have a gradient."""
+        """Text with the errors of the box and of the other inputs, over cars that have a gradient."""
         found = self.gradients[mode]
         if found is None:
             return "refused"
-        # Relative to the differences; absolute where they are below a thousandth.
+        # Errors are relative to the differences, but absolute for differences below a thousandth.
         error = (found - self.numeric_smaller).abs() / self.numeric_smaller.abs().clamp_min(1e-3)
         has_gradient = (found != 0).any(dim=0)
         counted = self.smooth & has_gradient
@@ -218,17 +218,17 @@ class Row:
         return ", ".join([*numbers, *([f"{lost} without"] if lost else [])])
 
     def cells(self) -> list[str]:
-        """Of the table."""
+        """The cells of the table."""
         counts = (str(int(part.sum())) for part in (self.smooth, ~self.smooth))
         return [self.option, *counts, *(self.errors(mode) for mode in self.gradients)]
 
 
 def study(scene: Scene, options: Sequence[str], modes: Sequence[str], report: Callable[[str], None]) -> list[Row]:
-    """All of them."""
+    """The rows of all options."""
     rows = []
     for option in options:
         settings = [*scene.settings, *OPTIONS.get(option, (option,) if "=" in option else ())]
-        # With a mode, because those march their rays under `no_grad` too.
+        # A mode is set, because modes march their rays under `no_grad` too.
         config = load_config(None, [*settings, "backward.mode=unroll"])
         numeric, smaller = (differences(scene, config, step) for step in (_STEP, _SMALLER_STEP))
         rows.append(Row(option, numeric, smaller, {mode: _by_mode(scene, settings, mode) for mode in modes}))
@@ -247,14 +247,14 @@ def _by_mode(scene: Scene, settings: Sequence[str], mode: str) -> Tensor | None:
 
 
 def as_markdown(rows: Sequence[Row]) -> str:
-    """A table behind docs/gradients.md: median / largest error of the box, and of the other inputs."""
+    """The table of docs/gradients.md: median / largest error of the box, and of the other inputs."""
     header = ("option", "pairs", "at jumps", *rows[0].gradients)
     lines = [header, ("---",) * len(header), *(row.cells() for row in rows)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
 def run(args: argparse.Namespace) -> None:
-    """Study, print, write."""
+    """Study the gradients, print and write."""
     scene = SCENES[args.scene](args.cars)
     rows = study(scene, args.option, args.mode, lambda line: print(line, file=sys.stderr))
     print(as_markdown(rows), end="")

@@ -1,10 +1,10 @@
-"""The Jacobian laboratory: every derivative of the energy three ways, in named regimes, with real image content.
+"""This script compares every derivative of the energy three ways, in named regimes, with real image content.
 
-Every term (silhouettes and tilt in both forms, photometric, points, all priors) has its hand-derived Jacobian compared
-with autograd and with central differences (Richardson extrapolation over a sweep of steps), and its gradient the
-derivative by autograd with differences. Entries that differences cannot judge, as their own estimate of error says, are
-excluded and counted. A term of one's own, `--term module:factory`, is examined as the built-in ones are, and its shapes
-are checked. Exit code 1 when a bound is broken: analytic against autograd 1e-9, against numeric 1e-6, relative to the
+For every term (silhouettes and tilt in both forms, photometric, points, all priors) the hand-derived Jacobian is
+compared with autograd and with central differences (Richardson extrapolation over a sweep of steps), and the derivative
+of its gradient by autograd with differences. Entries that differences cannot judge, by their own estimate of error, are
+excluded and counted. A user's own term, `--term module:factory`, is examined like the built-in ones, and its shapes are
+checked. The exit code is 1 if a bound is broken: analytic against autograd 1e-9, against numeric 1e-6, relative to the
 norm of the row, float64; less than 2 percent excluded in the typical regime.
 
     python scripts/check_gradients.py --out gradients
@@ -12,7 +12,7 @@ norm of the row, float64; less than 2 percent excluded in the typical regime.
     python scripts/check_gradients.py --term my_terms:upright --regime typical
     python scripts/check_gradients.py --data KITTI --frame 000107 --out gradients_kitti
 
-What the columns mean: docs/gradients.md.
+docs/gradients.md explains the columns.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from directshape_torch.shape.pca_prior import PCAShapePrior
 
 
 def load_factory(name: str) -> TermFactory:
-    """The factory `(frames, detections, cars, prior) -> Term` of a term of one's own, by "module:factory".
+    """The factory `(frames, detections, cars, prior) -> Term` of a user's own term, by "module:factory".
 
     Raises:
         InputError: there is no such module or factory.
@@ -57,10 +57,10 @@ def load_factory(name: str) -> TermFactory:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Examine, print, write; returns the exit code.
+    """Examine, print and write; return the exit code.
 
     Raises:
-        DirectShapeError: unknown names, a term of wrong shapes, a data set that cannot be read.
+        DirectShapeError: a name is unknown, a term has wrong shapes, or a data set cannot be read.
     """
     if args.states < 1:
         raise InputError("--states", "at least 1", f"{args.states}")
@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse the command line and run; 0: all bounds hold, 1: one is broken, 2: wrong use."""
+    """Parse the command line and run; return 0 if all bounds hold, 1 if one is broken, 2 for wrong use."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "--states", type=int, default=8, metavar="N", help="states in each regime (default 8: a minute)"

@@ -1,4 +1,4 @@
-"""How every script ends: with its exit code, and with one line for input that it cannot use."""
+"""This module runs a script and gives its exit code, with one line for input that it cannot use."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ def run_command(
     run: Callable[[argparse.Namespace], int | None],
     arguments: Sequence[str] | None = None,
 ) -> int:
-    """Parse the command line (None: the process's own) and run; wrong input is told on stderr.
+    """Parse the command line (None: of the process) and run; errors of input are printed on stderr.
 
     Returns:
-        The exit code: what `run` returns (None is 0), or 2 for wrong input.
+        The exit code: the result of `run` (None is 0), or 2 for wrong input.
     """
     args = parser.parse_args(arguments)
     try:

@@ -1,4 +1,4 @@
-"""Cars in tracks against the same cars by themselves: what more frames of a car are worth.
+"""This script compares cars in tracks with the same cars refined by themselves.
 
     for seed in 0 1 2 3 4 5 6 7; do
         python scripts/render_demo_scene.py --out out/sequences --sequence 0.3 --frames 8 --seed $seed \\
@@ -7,13 +7,13 @@
     python scripts/compare_tracks.py --data out/sequences --detections out/sequences/detections/noisy_stereo \\
         --masks out/sequences/training/masks --out out/tracks
 
-Every sequence is cut into pieces of as many frames as `--views` says, each refined in one call; the first number is
-what the others are compared with. The same cars count in all: those that can be asked of an image (`is_counted`),
-with the box that is returned, refined or not. With `--interval` cars move smoothly (docs/tracks.md).
+Every sequence is cut into pieces of as many frames as `--views` says, each refined in one call; the first number is the
+one that the others are compared with. All numbers use the same cars: those that can be expected to be found
+(`is_counted`), with the box that is returned, refined or not. With `--interval` cars move smoothly (docs/tracks.md).
 
-Prints tables in markdown: all cars, those that turn to the camera by
-more than `--turn-deg` within their sequence, and median errors of near and far faces by distance. Writes one line a
-car, frame and number of frames to `OUT/cars.csv`.
+The script prints tables in markdown: all cars, cars that turn relative to the camera by more than `--turn-deg` within
+their sequence, and median errors of near and far faces by distance. It writes one line for each car, frame and number
+of frames to `OUT/cars.csv`.
 """
 
 from __future__ import annotations
@@ -48,21 +48,21 @@ _WORSE = 0.05
 _WITHIN_SIGMAS = 2.0
 _DISTANCES_M = (0.0, 12.0, 20.0, 30.0, np.inf)
 
-# Without --rig cameras are exact, and what the images say is compared.
+# Without --rig cameras are taken to be exact, and the results of the images are compared.
 _AS_IT_IS = "rig.disparity_sigma_px=0", "priors.detector_weight=0"
 
 
 @dataclass(frozen=True)
 class CarOfFrame:
-    """A car in one frame, refined with `views` frames in a call; errors in metres, above 0 too long or too far.
+    """A `CarOfFrame` is a car in one frame, refined with `views` frames in a call.
 
     Attributes:
-        track: of the label.
-        given_track: of the detection.
+        track: track of the label.
+        given_track: track of the detection.
         part: see `RefinementResult.track_part`.
-        not_worse: probability of that against the input, NaN where none is known.
-        along_sigmas, yaw_sigmas: errors along the viewing ray and of the axis in standard deviations that the result
-            says; NaN where it says none.
+        not_worse: probability to be not worse than the input, NaN if unknown.
+        along_sigmas, yaw_sigmas: errors along the viewing ray and of the axis in standard deviations of the result; NaN
+            without these.
     """
 
     sequence: str
@@ -171,7 +171,7 @@ def _reach(
     boxes: Tensor,  # (N, 7)
     true: Tensor,  # (N, 7)
 ) -> Tensor:
-    """(N, 2) where boxes begin and end along the viewing rays of the true ones, seen from above."""
+    """Ranges (N, 2) of boxes along the viewing rays of the true ones, seen from above."""
     corners = box_corners(pose_from_kitti(boxes[:, :3], boxes[:, 6]), boxes[:, 3:6])[..., [0, 2]]
     rays = true[:, [0, 2]] / true[:, [0, 2]].norm(dim=1, keepdim=True)
     along = (corners * rays[:, None]).sum(dim=-1)
@@ -179,7 +179,7 @@ def _reach(
 
 
 def _timed(item: LoadedFrame, number: int, interval_s: float | None) -> LoadedFrame:
-    """The frame at a time of its own, or at none, whatever its files say."""
+    """The frame with a time from the interval, or without a time, whatever its files say."""
     frame = item.frame
     time_s = None if interval_s is None else frame.images_left.new_tensor([number * interval_s])
     return replace(item, frame=replace(frame, time_s=time_s))
@@ -224,7 +224,7 @@ def _split(cars: Sequence[CarOfFrame]) -> str:
 
 
 def _turning(cars: Sequence[CarOfFrame], turn_deg: float) -> set[tuple[str, int]]:
-    """Keys of the cars whose observation angle changes by that much within their sequence."""
+    """Keys of the cars whose observation angle changes by more than this within their sequence."""
     alphas: dict[tuple[str, int], list[float]] = {}
     for car in cars:
         alphas.setdefault((car.sequence, car.track), []).append(car.alpha)
@@ -270,7 +270,7 @@ def _rms(values: Sequence[float]) -> float:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse the command line and run; returns the exit code."""
+    """Parse the command line and run; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, metavar="ROOT", help="folder of the data set, with labels")
     parser.add_argument("--layout", choices=("tracking", "raw", "folder"), default="tracking")

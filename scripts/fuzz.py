@@ -1,13 +1,14 @@
-"""Odd arguments, damaged files, killed and faulty runs, by the thousand: what holds, in numbers.
+"""This script tests odd arguments, damaged files, and killed and faulty runs by the thousand, and counts failures.
 
     python scripts/fuzz.py --calls 5000 --files 20000 --kills 40 --faults 1 --out fuzz
     python scripts/fuzz.py --files 1 --seed 1234          # one case again
 
-Calls and files are those of `tests/fuzz`, made from their seeds, each in a child process with a memory limit and a time
-limit. An odd value or a damaged file is accepted or refused by an error of the package; all else is a finding, and the
-exit code is 1. Kills end runs, or their workers, with SIGKILL, SIGTERM or SIGINT at a random moment, their start
-included; faults make every n-th write or rename fail with ENOSPC or EIO, and take the output folder away. After each
-the next run must end with the bytes of one that nothing happened to. Written: `fuzz.json` and, readable, `fuzz.txt`.
+Calls and files are those of `tests/fuzz`, made from their seeds, each in a child process with limits of memory and
+time. An odd value or a damaged file must be accepted, or refused by an error of the package; everything else is a
+finding, and the exit code is 1. Kills end runs or their workers with SIGKILL, SIGTERM or SIGINT at a random moment,
+also during their start. Faults make every n-th write or rename fail with ENOSPC or EIO, and remove the output folder.
+After each disturbance the next run must end with the bytes of an undisturbed run. The results are `fuzz.json` and, for
+readers, `fuzz.txt`.
 """
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ from directshape_torch.files.atomic_files import write_json, write_text  # noqa:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Everything that was asked for; 1 where something was found.
+    """Run everything that was asked for; return 1 if there are findings.
 
     Raises:
-        InputError: a number below 0.
+        InputError: a number is below 0.
     """
     for name in ("calls", "files", "kills", "faults"):
         if getattr(args, name) < 0:
@@ -56,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def as_table(figures: dict[str, dict[str, object]]) -> str:
-    """A line for each outcome of each kind, then what was found."""
+    """Text with a line for each outcome of each kind, then the findings."""
     lines = [
         f"{kind:8} {name:44} {value}"
         for kind, counts in figures.items()
@@ -72,7 +73,7 @@ def _say(line: str) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse the command line and run; 0: nothing found, 1: something, 2: wrong use."""
+    """Parse the command line and run; return 0 without findings, 1 with findings, 2 for wrong use."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--calls", type=int, default=0, metavar="N", help="calls with an odd argument")
     parser.add_argument("--files", type=int, default=0, metavar="N", help="damaged files")

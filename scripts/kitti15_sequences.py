@@ -1,10 +1,10 @@
-"""Neighbouring frames of KITTI stereo 2015 as sequences of the tracking benchmark, for compare_tracks.py.
+"""This script writes neighbouring frames of KITTI Stereo 2015 as tracking sequences, for compare_tracks.py.
 
     python scripts/kitti15_sequences.py --data $DIRECTSHAPE_DATA/kitti15 --out out/kitti15
 
-The data have the object benchmark's folders, `frames.csv`, which names the drive of each frame, and COCO masks whose
-`instance_id` is KITTI MOTS's: a car has the same in all frames of a drive. Labels and detections get the number of the
-mask that they overlap. Drives in which no car is seen twice are left out; times between frames are not known.
+The data have the object benchmark's folders, `frames.csv` with the drive of each frame, and COCO masks whose
+`instance_id` is KITTI MOTS's, which a car keeps in all frames of a drive. Labels and detections get the number of the
+mask that they overlap. Drives without a car in two frames are left out; times between frames are not known.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.mask_matching import MIN_OVERLAP, assign
 
-_CAR = 3  # COCO's
-# More than MOTS has instances: for what has no mask, a number for each line of each frame.
+_CAR = 3  # category of COCO
+# Larger than all MOTS instances, this starts the numbers of objects without a mask, one for each line of each frame.
 _UNKNOWN = 100_000
 
 
@@ -44,14 +44,14 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _cars(data: Path, name: str) -> dict[int, list[float]]:
-    """2D boxes of the masks of cars, by the numbers of these."""
+    """2D boxes of the masks of cars, by their numbers."""
     entries = json.loads((data / "training/masks" / f"{name}.json").read_text())
     boxes = {entry["instance_id"]: entry["bbox"] for entry in entries if entry["category_id"] == _CAR}
     return {number: [u, v, u + width, v + height] for number, (u, v, width, height) in boxes.items()}
 
 
 def write_sequence(data: Path, names: Sequence[str], sequence: str, out: Path) -> None:
-    """Frames of one drive, in their order."""
+    """Write the frames of one drive, in their order."""
     detectors = sorted(path.parent.name for path in (data / "detections").glob("*/data"))
     tables: dict[str, list[str]] = {f"label_02/{sequence}.txt": []}
     tables |= {f"detections/{detector}/{sequence}.txt": [] for detector in detectors}
@@ -75,7 +75,7 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def _numbered(file: Path, frame: int, cars: dict[int, list[float]]) -> list[str]:
-    """The lines of a file with their frame and track before them."""
+    """The lines of a file with frame and track in front of them."""
     objects = read_objects(file)
     boxes = np.array([each.box_2d if each.type == "Car" else (0.0,) * 4 for each in objects]).reshape(-1, 4)
     overlap = box_iou(boxes, np.array([*cars.values()]).reshape(-1, 4))
@@ -85,7 +85,7 @@ def _numbered(file: Path, frame: int, cars: dict[int, list[float]]) -> list[str]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse the command line and run; returns the exit code."""
+    """Parse the command line and run; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="with frames.csv, training, detections")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a folder that does not exist yet")

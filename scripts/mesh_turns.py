@@ -1,9 +1,9 @@
-"""How surely wrong axes and units of real meshes are found: every mesh in its 24 turns and seven units.
+"""This script counts how often wrong axes and units of real meshes are found, for 24 rotations and seven units.
 
     python scripts/mesh_turns.py --meshes DIR
 
-Prints for each unit how many cases were refused, with which axes and unit named, and which wrong ones passed. Meshes
-are metres with x forward and z up, glb files z forward and y up.
+For each unit it prints how many cases were refused, with which named axes and unit, and which wrong ones passed. Meshes
+are in metres with x forward and z up; glb files have z forward and y up.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from directshape_torch.shape.car_looks import check_looks
 from directshape_torch.shape.outlines import AXES, Outlines
 
 TURNS = [(forward, up) for forward, up in permutations(AXES, 2) if AXES[forward] != AXES[up]]
-# Units of a metre, and the option that names them; a mesh of unit size has no unit.
+# These are units per metre, and the option that names them; a mesh of unit size has no unit.
 UNITS: dict[str, tuple[float | None, tuple[str, float] | None]] = {
     "metres": (1.0, None),
     "millimetres": (1e3, ("scale", 0.001)),
@@ -46,7 +46,7 @@ def triangles_of(path: Path) -> NDArray[np.float64]:
 
 
 def needed(triangles: NDArray[np.float64], forward: str, up: str, factor: float) -> dict[str, str | float] | None:
-    """The options that a mesh needs whose front and roof point to these axes; None where it passes as it is."""
+    """The options that a mesh with front and roof along these axes needs, or None if it passes unchanged."""
     left = np.cross(vector(up), vector(forward))
     turned = factor * triangles @ np.stack([vector(forward), left, vector(up)])
     try:
@@ -57,7 +57,7 @@ def needed(triangles: NDArray[np.float64], forward: str, up: str, factor: float)
 
 
 def outcome(triangles: NDArray[np.float64], forward: str, up: str, unit: str) -> str:
-    """What is said of a mesh in a turn and a unit, in a word or two."""
+    """The result for a mesh in a rotation and a unit, in a few words."""
     factor, size_option = UNITS[unit]
     cure = needed(triangles, forward, up, 1 / float(np.ptp(triangles[..., 0])) if factor is None else factor)
     if cure is None:

@@ -1,8 +1,9 @@
-"""Does the test suite notice a mistake in a hand-derived Jacobian? Makes such mistakes and looks.
+"""This script makes mistakes in hand-derived Jacobians and checks that the tests notice them.
 
-Every arithmetic node, component and axis of the functions that hold derivatives is changed, one at a time (sign flip,
-dropped factor, dropped term, swapped axis); each mutant must be caught by the tests named for that function. Prints
-mutant, verdict and the test that caught it; exit code 1 where a mutant survives. The checkout is never edited.
+Every arithmetic node, component and axis of the functions with derivatives is changed, one at a time (sign flip,
+dropped factor, dropped term, swapped axis); each mutant must be caught by the tests named for that function. The script
+prints mutant, verdict and the test that caught it; the exit code is 1 if a mutant survives. The checkout is never
+edited.
 
     python scripts/mutate_jacobians.py [--target NAME ...] [--sample N --seed S] [--processes 2]
 """
@@ -21,13 +22,13 @@ from jacobian_mutants.runner import Outcome, UnmutatedFailureError, run_mutants
 from jacobian_mutants.targets import TARGETS, Target, reason_for
 from tqdm import tqdm
 
-# How the messages of failed comparisons begin, in pytest's own asserts and in those of torch.
+# Messages of failed comparisons begin like this, in pytest's own asserts and in those of torch.
 _WRONG_NUMBER = ("AssertionError", "assert", "Failed", "GradcheckError", "torch.autograd.gradcheck")
 ROOT = Path(__file__).resolve().parents[1]
 
 
 def all_mutants(root: Path, targets: dict[str, Target]) -> list[tuple[str, Mutant]]:
-    """Every mutant (target, mutant) of the targets, the equivalent ones included."""
+    """Every mutant (target, mutant) of the targets, including the equivalent ones."""
     return [
         (name, mutant)
         for name, target in targets.items()
@@ -36,7 +37,7 @@ def all_mutants(root: Path, targets: dict[str, Target]) -> list[tuple[str, Mutan
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; see the module's description."""
+    """Parse the command line and run; return the exit code."""
     options = _parser().parse_args(arguments)
     targets = {name: TARGETS[name] for name in options.target or TARGETS}
     everything = all_mutants(ROOT, targets)
@@ -65,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def told(outcome: Outcome) -> tuple[str, str]:
-    """Where and what the mutant is; the verdict and the test that gave it."""
+    """Place and change of the mutant; verdict and the test that gave it."""
     m = outcome.mutant
     where = f"{m.path}:{m.line} {m.function}: {m.kind}: {_short(m.before)} -> {_short(m.after)}"
     if outcome.verdict != "caught":
@@ -75,7 +76,7 @@ def told(outcome: Outcome) -> tuple[str, str]:
 
 
 def summary(outcomes: Sequence[Outcome]) -> str:
-    """Counts of verdicts."""
+    """Text with the counts of verdicts."""
     crashed = sum(outcome.verdict == "caught" and not is_wrong_number(outcome) for outcome in outcomes)
     count = Counter(outcome.verdict for outcome in outcomes)
     return (

@@ -1,17 +1,18 @@
-"""Renders stereo frames of a street with parametric cars, in KITTI's layout, with exact ground truth.
+"""This script renders stereo frames of a street with parametric cars, in KITTI's layout, with exact ground truth.
 
     pip install 'directshape_torch[render]'
     python scripts/render_demo_scene.py --out DIR --frames N --seed S [--sequence SECONDS]
 
-Frame k has seed S + k and holds: left and right images (1242 x 375), calibration, labels, ground plane, exact instance
-masks (COCO RLE), a description of the scene (`meta`: exact poses and measures), and noisy detections as of a stereo
-detector. With `--sequence` the frames are of one moving scene (passing parked cars, turning, overtaking or pulling out,
-as the seed has it), in the layout of KITTI's tracking benchmark, with tracks, times and the camera's motion.
+Frame k has seed S + k and contains left and right images (1242 x 375), calibration, labels, ground plane, exact
+instance masks (COCO RLE), a description of the scene (`meta`: exact poses and measures), and noisy detections as of a
+stereo detector. With `--sequence` the frames are of one moving scene (passing parked cars, turning, overtaking or
+pulling out, depending on the seed), in the layout of KITTI's tracking benchmark, with tracks, times and the camera's
+motion.
 
-The same seed gives the same scene; the pixels are the same on the same renderer version and variant. A frame takes
-minutes (6 with `--cars 4 --paths-per-pixel 1` on two busy cores). Needs Mitsuba 3 and pyoidn.
+Equal seeds give equal scenes; the pixels are equal with the same renderer version and variant. A frame takes minutes (6
+with `--cars 4 --paths-per-pixel 1` on two busy cores). The script needs Mitsuba 3 and pyoidn.
 `--variant scalar_rgb` runs as installed; `llvm_ad_rgb` (40 s with `--paths-per-pixel 4`) needs an LLVM library of
-version 19 (Debian: `apt-get update && apt-get install libllvm19`), older ones crash.
+version 19 (Debian: `apt-get update && apt-get install libllvm19`), because older ones crash.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from demo_scene.rendering import import_mitsuba
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse the command line and run; returns the exit code."""
+    """Parse the command line and run; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder that gets training/ and detections/")
     parser.add_argument("--frames", type=int, default=1, help="number of frames (default 1)")

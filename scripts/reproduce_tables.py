@@ -1,13 +1,13 @@
-"""The paper's experiments on a data set: average precision of every method, and the ablation, row by row.
+"""This script repeats the paper's experiments on a data set: average precision of every method, and the ablation.
 
     R=$DIRECTSHAPE_DATA/rendered
     python scripts/reproduce_tables.py pose --data $R --detections $R/detections/stereo --masks $R/training/masks
     python scripts/reproduce_tables.py ablation --data $R --detections $R/detections/stereo --masks $R/training/masks
 
-A row is a call of `directshape refine` with the words that stand beside its name below, in a folder of its own under
---out: a second call makes the table only, and one that was stopped goes on. Other data, detections or masks want
-another --out. What the ablation calls a difference is the mean change of BEV IoU to the default, of the same cars, with
-its 95 % interval over cars.
+A row is a call of `directshape refine` with the words beside its name below, in its own folder under --out. A second
+call only makes the table, and an interrupted call continues. Other data, detections or masks need another --out. A
+difference in the ablation is the mean change of BEV IoU from the default, of the same cars, with its 95 % interval over
+cars.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ TABLES = {"pose": METHODS, "ablation": ABLATION}
 
 
 def words_of(row: str) -> list[str]:
-    """The words that a row adds to a call of `directshape refine`: options, or settings; every result is returned.
+    """The words that a row adds to a call of `directshape refine`: options or settings, with every result returned.
 
     Examples:
         >>> words_of("solver.rays=marched")[-1]
@@ -83,16 +83,16 @@ def words_of(row: str) -> list[str]:
 
 
 def folder_of(args: argparse.Namespace, name: str) -> Path:
-    """Where a row is refined."""
+    """The folder of a row."""
     return Path(args.out) / "".join(c if c.isalnum() else "_" for c in name)
 
 
 def refined(args: argparse.Namespace, name: str) -> Path:
-    """The folder of a row, refined where it is not yet.
+    """The folder of a row, which is refined now if it was not before.
 
     Raises:
-        InputError: no such row.
-        DirectShapeError: a run that did not end well; it has said why.
+        InputError: there is no such row.
+        DirectShapeError: a run did not end well, as it has reported.
     """
     rows, out = TABLES[args.table], folder_of(args, name)
     if name not in rows:
@@ -107,7 +107,7 @@ def refined(args: argparse.Namespace, name: str) -> Path:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Refine and compare row by row; the table is printed as Markdown and kept in `TABLE.md`."""
+    """Refine and compare row by row; print the table as Markdown and write it to `TABLE.md`."""
     default, lines = comparison(args, DEFAULT), []
     for when, name in (("before", "input"), ("after", DEFAULT)):
         folder = args.detections if when == "before" else folder_of(args, DEFAULT) / "data"
@@ -127,14 +127,14 @@ HEAD = ("", "BEV IoU, mean", "3D IoU, mean", "worse", "against default",
 
 
 def comparison(args: argparse.Namespace, name: str) -> Comparison:
-    """A row's boxes against the labels, of the cars that have a mask."""
+    """A row's boxes compared with the labels, over the cars that have a mask."""
     out = refined(args, name)
     labels = args.data / "training" / "label_2"
     return compare_results(labels, args.detections, out / "data", frames=args.frames, shapes_dir=out / "shapes")
 
 
 def box_cells(found: Comparison, when: str) -> list[str]:
-    """Mean overlaps, and the share made worse."""
+    """Cells with mean IoUs and the share made worse."""
     bev, in_3d = (getattr(found.overall.metrics[key], when) for key in ("bev_iou_mean", "iou_3d_mean"))
     worse = found.overall.worse_share
     is_after = when == "after" and worse is not None
@@ -142,7 +142,7 @@ def box_cells(found: Comparison, when: str) -> list[str]:
 
 
 def difference(default: Comparison, found: Comparison) -> str:
-    """Mean BEV IoU of a row less that of the default, the same cars in every draw."""
+    """Mean BEV IoU of a row less that of the default, over the same cars in every draw."""
     cars = [{(car.frame_id, car.detection_line): car.after.bev_iou for car in side.cars} for side in (default, found)]
     common = sorted(set(cars[0]) & set(cars[1]))
     before, after = (np.array([side[key] for key in common]) for side in cars)
@@ -157,7 +157,7 @@ def ap_cells(args: argparse.Namespace, results: Path) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse the command line and run; returns the exit code."""
+    """Parse the command line and run; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", choices=tuple(TABLES))
     parser.add_argument("--data", type=Path, required=True, metavar="ROOT", help="KITTI's layout, with labels")

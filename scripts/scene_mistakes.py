@@ -1,9 +1,9 @@
-"""What `check_scene` says of common mistakes, as a table.
+"""This script makes a table of the answers of `check_scene` to common mistakes.
 
     python scripts/scene_mistakes.py --data DIR --detections DIR
 
 
-Each mistake is made in the tensors of correct frames of a data set in KITTI's layout; the answer must name it.
+Each mistake is made in the tensors of correct frames of a data set in KITTI's layout, and the answer must name it.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ Scene = tuple[FrameBatch, Detections]
 
 @dataclass(frozen=True)
 class Mistake:
-    """One mistake."""
+    """A `Mistake` is one mistake with the expected answer."""
 
-    make: Callable[[FrameBatch, Detections], Scene]  # changes a correct scene
-    says: tuple[str, str]  # what an answer that names it contains: the check, and words of measurement or cure
-    of_images: bool = False  # it takes features of both images to see it
+    make: Callable[[FrameBatch, Detections], Scene]  # function that changes a correct scene
+    says: tuple[str, str]  # check, and words of measurement or cure, in an answer that names it
+    of_images: bool = False  # whether features of both images are needed to find it
 
 
 def answer(mistake: Mistake, correct: Scene) -> CheckReport:
-    """What is said of a scene with the mistake."""
+    """The report about a scene with the mistake."""
     return check_scene(*mistake.make(*correct), match_images=mistake.of_images)
 
 
@@ -52,7 +52,7 @@ def named(mistake: Mistake, report: CheckReport) -> bool:
 
 
 def _boxes(change: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]) -> Callable[..., Scene]:
-    """`change(location (B, 3), hwl (B, 3), yaw (B,))`."""
+    """A mistake from `change(location (B, 3), hwl (B, 3), yaw (B,))`."""
 
     def make(frames: FrameBatch, d: Detections) -> Scene:
         location, hwl, yaw = change(
@@ -86,7 +86,7 @@ def _permuted(*signed: int) -> Callable[[Tensor], Tensor]:
 
 
 def _intrinsics(scale: float, rows: int = 2, columns: int = 3) -> Callable[..., Scene]:
-    """Factor of the first rows and columns of both K."""
+    """A mistake that multiplies the first rows and columns of both K by a factor."""
 
     def make(frames: FrameBatch, d: Detections) -> Scene:
         factor = torch.ones(3, 3).to(frames.camera.K_left)
@@ -103,7 +103,7 @@ def _focal(scale: float) -> Callable[..., Scene]:
 
 
 def _raw_intrinsics(frames: FrameBatch, d: Detections) -> Scene:
-    """K of two raw cameras for that of the images rectified from theirs: each off in its own way."""
+    """A mistake with K of two raw cameras in place of the rectified ones, each with its own error."""
     camera = frames.camera
     changed = {}
     for name, scale, centre in (("K_left", 1.02, (9.0, 4.0)), ("K_right", 1.03, (-5.0, -3.0))):
@@ -132,7 +132,7 @@ def _images(change: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]) -> Callab
 
 
 def _masks(change: Callable[[Tensor], Tensor]) -> Callable[..., Scene]:
-    """Of both sides; masks and 2D boxes around them as a program would make them from the wrong masks."""
+    """A mistake in the masks of both sides, with masks and 2D boxes as a program would make them from wrong masks."""
 
     def make(frames: FrameBatch, d: Detections) -> Scene:
         left, right = (MaskCrops.of(change(masks.dense())) for masks in (d.mask_left, d.mask_right))
@@ -142,7 +142,7 @@ def _masks(change: Callable[[Tensor], Tensor]) -> Callable[..., Scene]:
 
 
 def _other_order(frames: FrameBatch, d: Detections) -> Scene:
-    """Masks of the next car of the same frame."""
+    """A mistake with the masks of the next car of the same frame."""
     order = torch.arange(len(d))
     for number in range(len(frames)):
         (rows,) = (d.frame_index == number).nonzero(as_tuple=True)
@@ -238,7 +238,7 @@ def scene(root: Path, detections: Path, masks: Path, count: int = 6, first: int 
     """Some frames of a data set as one batch."""
     dataset = open_dataset("kitti", root, detections, masks, ground="camera_height")
     frames, found = collate([dataset.load(frame_id) for frame_id in dataset.frame_ids[first : first + count]])
-    # As `Detections.from_boxes` makes them: boxes of a file may be projections of the labels, and tell too much.
+    # 2D boxes are made as by `Detections.from_boxes`, because those of a file may be projections of the labels.
     return frames, replace(found, box_2d=found.mask_left.box_2d.to(found.box_2d))
 
 

@@ -1,11 +1,11 @@
-"""Train `directshape_torch/assets/neural_prior.safetensors`: a small network as shape prior, from parametric cars.
+"""This script trains `directshape_torch/assets/neural_prior.safetensors`, a small network as shape prior.
 
     python scripts/train_neural_prior.py [--num-cars 600 --num-codes 8 --steps 6000 --seed 0 --out PATH]
 
-No mesh goes in: every car comes from `parametric_cars`, the same cars as in the bundled PCA
-prior (seeds from 0). An auto-decoder: the codes of the training cars start at their whitened principal components and
-are learned with the weights; at the end they are whitened again, and the map that does it is folded into the weights.
-One idle core: three minutes for the cars, two for the weights. Seeded: the same bytes on the same machine.
+Every car comes from `parametric_cars`, with the same seeds (from 0) as in the bundled PCA prior; no meshes are used.
+The network is an auto-decoder: the codes of the training cars start at their whitened principal components and are
+learned with the weights; at the end they are whitened again, and the map for it is folded into the weights. On one idle
+core the cars take three minutes and the weights two. Equal seeds give equal bytes on the same machine.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ Array = NDArray[np.float64]
 NEAR_POINTS, FAR_POINTS = 6000, 3000
 FIRST_POINT_SEED = 10_000_000
 NEAR_SPREADS_M = (0.01, 0.03, 0.1)
-# Points count by their distance to the surface, like the nodes in the PCA prior: refinement looks at the zero level.
+# Points are weighted by their distance to the surface, like the nodes in the PCA prior, because refinement uses the
+# zero level.
 SURFACE_BAND_M, FAR_WEIGHT = 0.15, 0.05
 CARS_PER_STEP, POINTS_PER_CAR = 128, 64
 CODE_PENALTY = 1e-4
@@ -42,7 +43,7 @@ CODE_PENALTY = 1e-4
 
 @dataclass(frozen=True)
 class TrainingCars:
-    """Signed distances of N cars at random points and on the grid of the PCA prior."""
+    """A `TrainingCars` has signed distances of N cars at random points and on the grid of the PCA prior."""
 
     points: Tensor  # (N, P, 3) metres
     sdf: Tensor  # (N, P) metres
@@ -50,7 +51,7 @@ class TrainingCars:
 
 
 def sample_points(seed: int) -> tuple[Array, Array]:
-    """Points about the surface and all over the bounds of the car with this seed, and their signed distances."""
+    """Points near the surface and in the bounds of the car with this seed, and their signed distances."""
     rng = np.random.default_rng(FIRST_POINT_SEED + seed)
     car = sample_car(seed)
     vertices = np.asarray(car_mesh(car, 0.04).vertices)
@@ -64,7 +65,7 @@ def sample_points(seed: int) -> tuple[Array, Array]:
 
 
 def make_cars(num_cars: int, kept: Path | None) -> TrainingCars:
-    """The cars with seeds from 0; read from the file `kept` where it exists, else written to it."""
+    """The cars with seeds from 0, read from the file `kept` if it exists, else written to it."""
     if kept is not None and kept.exists():
         with np.load(kept, allow_pickle=False) as file:
             return TrainingCars(*(torch.from_numpy(file[name]) for name in ("points", "sdf", "grids")))
@@ -83,7 +84,7 @@ def make_cars(num_cars: int, kept: Path | None) -> TrainingCars:
 def train(
     cars: TrainingCars, prior: NeuralShapePrior, code: Tensor, num_steps: int, rate: float, generator: torch.Generator
 ) -> Tensor:
-    """Train the prior in place; returns the learned codes (N, K)."""
+    """Train the prior in place; return the learned codes (N, K)."""
     code = code.clone().requires_grad_()
     optimiser = torch.optim.Adam([*prior.parameters(), code], lr=rate)
     progress = tqdm(range(num_steps), desc="steps", unit="step")
@@ -112,7 +113,7 @@ def _loss(cars: TrainingCars, prior: NeuralShapePrior, code: Tensor, generator: 
 
 @torch.no_grad()
 def whiten(prior: NeuralShapePrior, code: Tensor) -> Tensor:
-    """Fold `code = mean + white @ factor.T` into the weights; returns the white codes (N, K)."""
+    """Fold `code = mean + white @ factor.T` into the weights; return the white codes (N, K)."""
     mean, covariance = code.mean(0), code.T.cov()
     factor = torch.linalg.cholesky(covariance)
     for layer in prior.coded_layers():
@@ -123,7 +124,7 @@ def whiten(prior: NeuralShapePrior, code: Tensor) -> Tensor:
 
 @torch.no_grad()
 def fit_dimensions(prior: NeuralShapePrior, code: Tensor, grids: Tensor) -> Tensor:
-    """Fit the prior's quadratic map from white codes (N, K) to height, width and length; returns residuals (N, 3)."""
+    """Fit the prior's quadratic map from white codes (N, K) to height, width and length; return residuals (N, 3)."""
     extents = zero_level_extents(grids.double(), torch.tensor(GRID.origin).double(), GRID.spacing_m)
     dimensions = (extents[:, 1] - extents[:, 0])[:, [1, 2, 0]]
     z, num_codes = code.double(), code.shape[1]

@@ -1,8 +1,9 @@
-"""Writes `configs/default.yaml` from `directshape_torch/config.py`: each key with meaning, type, unit, limits, default.
+"""This script writes `configs/default.yaml` from `directshape_torch/config.py`.
 
     python scripts/write_default_config.py
 
-Run it after changing a setting; a test compares the two.
+Each key has its meaning, type, unit, limits and default. Run the script after changing a setting; a test compares the
+two.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""The suites of `scripts/benchmark.py`."""
+"""This package has the suites of `scripts/benchmark.py`."""

@@ -1,12 +1,14 @@
-"""`--against CHECKOUT`: how many times as long as another version do we take, and how many operations more?
+"""This module runs `--against CHECKOUT`: times and operations of this version, relative to another version.
 
-Each version has a process of its own, and the two are asked in turn, for the processor's time: what else the machine
-does slows down both. With nothing that a version of this project could lack: frames, default settings, the refiner.
+Each version has its own process, and the two are asked in turn for processor time, so that other load on the machine
+slows down both. The module uses only parts that every version of this project has: frames, default settings, the
+refiner.
 
     PYTHONPATH=CHECKOUT:scripts python -m benchmark_suites.checkouts
 
-is one such process: it says which scenes it has, then answers each line `MODE SCENE FIRST COUNT`, a call of so many
-frames with `compile` on or off, with its seconds, or its operations where the line ends in `operations`.
+This command runs one such process. It prints its scenes and then answers each line `MODE SCENE FIRST COUNT`, a call of
+COUNT frames with `compile` on or off, with the seconds of the call, or with its operations if the line ends in
+`operations`.
 """
 
 from __future__ import annotations
@@ -39,10 +41,10 @@ _ROUNDS = 7
 
 
 def against_rows(checkout: Path, data_root: Path | None, quick: bool = False) -> Iterator[Row]:
-    """Ratios of time and operations, here over there, for frames by themselves and 8 in a call.
+    """Ratios of time and operations, this version over the other, for single frames and for 8 in a call.
 
     Raises:
-        InputError: the folder holds no version of this package.
+        InputError: the folder has no version of this package.
         DirectShapeError: a version failed.
     """
     if not (checkout / "directshape_torch" / "__init__.py").is_file():
@@ -70,7 +72,7 @@ def against_rows(checkout: Path, data_root: Path | None, quick: bool = False) ->
 
 
 def _seconds(ours: _Version, theirs: _Version, line: str, rounds: int) -> Iterator[tuple[float, float]]:
-    """Of calls in turn, ours and theirs, in reversed order in every second round, after one that does not count."""
+    """Times of calls in turn, ours and theirs, with alternating order, after a first call that is not measured."""
     for number in range(rounds + 1):
         order = (ours, theirs) if number % 2 else (theirs, ours)
         seconds = {version: version.ask(line) for version in order}
@@ -79,19 +81,19 @@ def _seconds(ours: _Version, theirs: _Version, line: str, rounds: int) -> Iterat
 
 
 class _Version:
-    """The process of one version."""
+    """A `_Version` is the process of one version."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
 
     def ask(self, line: str) -> Any:
-        """What it answers to a line."""
+        """The answer to a line."""
         assert self._process.stdin is not None
         print(line, file=self._process.stdin, flush=True)
         return self.answer()
 
     def answer(self) -> Any:
-        """What it says next."""
+        """The next output of the process."""
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
@@ -104,7 +106,7 @@ def _version(root: Path, data_root: Path | None) -> Iterator[_Version]:
     scripts = Path(__file__).resolve().parents[1]
     command = [sys.executable, "-m", "benchmark_suites.checkouts", "--threads", str(torch.get_num_threads())]
     command += ["--data", str(data_root.resolve())] if data_root else []
-    # In the root, for the folder in which a module is started comes first in its path.
+    # The process starts in the root, because the start folder of a module comes first in its path.
     environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(root), str(scripts)))}
     with subprocess.Popen(
         command, cwd=root, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -113,7 +115,7 @@ def _version(root: Path, data_root: Path | None) -> Iterator[_Version]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """One version: answer until there are no more lines."""
+    """Run one version: answer lines until there are no more."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, metavar="ROOT")
     parser.add_argument("--threads", type=int, default=1)

@@ -1,4 +1,4 @@
-"""What is counted of one call, rather than timed: operations, memory of tensors."""
+"""This module counts operations and tensor memory of a call."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _MEMORY_EVENT = "[memory]"
 
 
 class OperationCount(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Counts the operations inside, by name, as PyTorch's kernels see them: views count, wrappers do not.
+    """An `OperationCount` counts operations by name on the level of PyTorch's kernels: views count, wrappers do not.
 
-    What is compiled elsewhere runs in its plain form inside.
+    Functions that would be compiled run in their plain form inside.
 
     Examples:
         >>> with OperationCount() as count:
@@ -40,7 +40,7 @@ class OperationCount(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
 
 def count_operations(call: Callable[[], object]) -> int:
-    """How many operations a call is made of. Eager calls of few cars take as long as these take to be launched."""
+    """Number of operations of a call. The time of eager calls of few cars is mostly the launch of operations."""
     count = OperationCount()
     with count:
         call()
@@ -48,14 +48,14 @@ def count_operations(call: Callable[[], object]) -> int:
 
 
 def peak_tensor_bytes(call: Callable[[], object], device: torch.device | None = None) -> int:
-    """Largest sum, while `call` runs, of the bytes of all tensors that it made and that still live.
+    """Largest total size, in bytes, of the living tensors that a call made, while it runs.
 
-    On a graphics card PyTorch's allocator keeps that figure. On a CPU it is summed up from the profiler's record of
-    allocations, without what libraries outside PyTorch and the system's allocator hold.
+    On a graphics card PyTorch's allocator records it. On a CPU it is the sum over the profiler's record of allocations,
+    without memory of libraries outside PyTorch and of the system's allocator.
 
     Args:
-        call: is called once, much slower than usual where it runs on a CPU.
-        device: None or a CPU, or the graphics card whose memory counts.
+        call: function that is called once, on a CPU much slower than usual.
+        device: graphics card whose memory counts; None or a CPU for the CPU.
 
     Examples:
         >>> peak_tensor_bytes(lambda: torch.zeros(1000, dtype=torch.float64))

@@ -1,8 +1,8 @@
-"""`--profile`: where the time and the operations of one eager call go, without a line of it in the measured code.
+"""This module runs `--profile`: time and operations of one eager call by part, without changes of the measured code.
 
-Python tells a hook of every function that begins and ends. The time between two events, and the operations in it,
-belong to the innermost running function of `PARTS`; all others are helpers of whoever called them. Parts are exclusive
-and add up to the whole, so a lookup counts where it is asked for; but what judges the result counts as a whole.
+Python calls a hook at the begin and end of every function. The time between two events, and the operations in it,
+belong to the innermost running function of `PARTS`; other functions count for their callers. Parts are exclusive and
+add up to the whole, so a lookup counts for its caller. The outcome of a result counts as a whole.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from directshape_torch.terms.silhouette import Silhouettes
 
 _REST = "everything else"
 _OUTCOME = "outcome: covariance, quality, profile, trust"
-# Of the functions themselves, so that one that goes takes its line with it.
+# The functions themselves are listed, so that removing one makes its line fail.
 PARTS: dict[str, tuple[Any, ...]] = {
     "observation: regions, occlusion, pixels": (DirectShapeRefiner._observe, problem_of_scene),
     "marched rays and first hits": (CarProblem.look,),
@@ -55,7 +55,7 @@ PARTS: dict[str, tuple[Any, ...]] = {
 
 
 def profile_rows(rounds: int) -> list[Row]:
-    """Milliseconds of each part of an eager call of the bundled frame's cars, default settings, and its operations."""
+    """Rows with milliseconds and operations of each part of an eager call of the bundled frame, default settings."""
     call = partial(make_refiner("default", False), *collate(demo_scene().frames))
     call()
     times = [profile_parts(call, time.perf_counter) for _ in range(rounds)]
@@ -71,11 +71,11 @@ def profile_rows(rounds: int) -> list[Row]:
 
 
 def profile_parts(call: Callable[[], object], reading: Callable[[], float]) -> Counter[str]:
-    """Run `call` once in this thread and say by how much a reading rises in each of `PARTS`, and in the rest.
+    """Run `call` once in this thread and return the increase of a reading in each of `PARTS` and in the rest.
 
     Args:
-        call: eager code; of compiled code only the call as a whole is seen.
-        reading: of a clock or a counter.
+        call: eager code; compiled code is seen only as a whole.
+        reading: reading of a clock or a counter.
     """
     recorder = _Recorder(reading)
     previous = sys.getprofile()
@@ -88,7 +88,7 @@ def profile_parts(call: Callable[[], object], reading: Callable[[], float]) -> C
 
 
 class _Recorder:
-    """Stack of the parts of the running functions."""
+    """A `_Recorder` has the stack of the parts of the running functions."""
 
     def __init__(self, reading: Callable[[], float]) -> None:
         self.risen: Counter[str] = Counter()
@@ -108,7 +108,7 @@ class _Recorder:
 
 
 def _code(function: Any) -> CodeType:
-    """The code of a function, a method, or whatever they wrap."""
+    """The code of a function, a method, or of the function that they wrap."""
     code = getattr(inspect.unwrap(function), "__code__", None)
     assert isinstance(code, CodeType), function
     return code

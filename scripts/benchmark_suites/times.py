@@ -1,4 +1,4 @@
-"""Times, operations and memory of whole calls; on a graphics card its agreement with the CPU too."""
+"""This module measures times, operations and memory of whole calls, and agreement of a graphics card with the CPU."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from directshape_torch.io.frame_collation import collate
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 
-_BATCH_FRAMES = 8  # of a call by somebody who refines a data set and does not wait for single frames
+_BATCH_FRAMES = 8  # of a call that refines a data set without waiting for single frames
 _PRESETS = ("default", "fast")
-# Sums in another order change a step's last digits, and a convergence test that is met one iteration sooner changes the
-# result by less than the test's own tolerance. Cars that settle in another minimum are what the share is for.
+# Sums in another order change the last digits of a step. A convergence test that is met one iteration earlier changes
+# the result by less than its tolerance. Cars above this distance converged to another minimum.
 _SAME_CENTRE_M = 0.01
 
 
 def make_refiner(preset: str, compiled: bool, *overrides: str) -> DirectShapeRefiner:
-    """A refiner with a preset's settings, on the CPU.
+    """A refiner with the settings of a preset, on the CPU.
 
     Examples:
         >>> make_refiner("fast", False, "silhouette.weight=6").config.silhouette.weight
@@ -35,7 +35,7 @@ def make_refiner(preset: str, compiled: bool, *overrides: str) -> DirectShapeRef
 
 
 def time_rows(scene: Scene, device: torch.device, rounds: int, quick: bool = False) -> Iterator[Row]:
-    """Both presets, eager and compiled, single frames and 8 in a call: milliseconds, operations, memory of tensors."""
+    """Milliseconds, operations and memory of both presets, eager and compiled, of single frames and of 8 in a call."""
     modes = (False,) if quick or compiler_problem() is not None else (False, True)
     refiners = {
         f"{preset}, {'compiled' if compiled else 'eager'}": make_refiner(preset, compiled).to(device)
@@ -43,7 +43,7 @@ def time_rows(scene: Scene, device: torch.device, rounds: int, quick: bool = Fal
         for compiled in modes
     }
     for size in (1,) if quick else (1, _BATCH_FRAMES):
-        # The last call is filled up with the first frames again: each is of the size that its name says.
+        # The last call is filled with the first frames again, so that every call has its full size.
         endless, count = itertools.cycle(scene.frames), -(-len(scene.frames) // size)
         calls = [on_device(*collate(list(itertools.islice(endless, size))), device) for _ in range(count)]
         sides = [{name: partial(refiner, *call) for name, refiner in refiners.items()} for call in calls]
@@ -58,7 +58,7 @@ def time_rows(scene: Scene, device: torch.device, rounds: int, quick: bool = Fal
 
 
 def device_rows(scenes: Sequence[Scene], device: torch.device) -> Iterator[Row]:
-    """Of a graphics card: the share of cars with the CPU's result."""
+    """The share of cars for which a graphics card gives the CPU's result."""
     for scene in scenes:
         refiner, call = make_refiner("default", False), collate(scene.frames)
         expected = refiner(*call).T_cam_obj
@@ -70,5 +70,5 @@ def device_rows(scenes: Sequence[Scene], device: torch.device) -> Iterator[Row]:
 
 
 def on_device(frames: FrameBatch, detections: Detections, device: torch.device) -> tuple[FrameBatch, Detections]:
-    """A call's inputs there."""
+    """The inputs of a call on a device."""
     return frames.to(device), detections.to(device)

@@ -1,6 +1,6 @@
-"""Wall-clock times that can be compared: warmed up, interleaved, medians with quartiles.
+"""This module measures comparable wall-clock times: warmed up, interleaved, medians with quartiles.
 
-Machines slow down and speed up while a benchmark runs: things that are to be compared are called in turn.
+Machines slow down and speed up during a benchmark, so calls that are compared are made in turn.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 
 @dataclass(frozen=True)
 class Spread:
-    """Median and quartiles of a sample.
+    """A `Spread` has the median and quartiles of a sample.
 
     Examples:
         >>> Spread.of([3.0, 1.0, 2.0, 4.0, 5.0])
@@ -29,7 +29,7 @@ class Spread:
 
     @classmethod
     def of(cls, sample: Sequence[float]) -> Spread:
-        """Of a sample of one number or more; the quartiles of one number are the number."""
+        """The spread of a sample of one number or more; the quartiles of one number are the number."""
         quarters = statistics.quantiles(sample, n=4, method="inclusive") if len(sample) > 1 else [sample[0]] * 3
         low, median, high = quarters
         return cls(median, low, high, len(sample))
@@ -37,7 +37,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Row:
-    """One figure of a table, with what must be known to read it."""
+    """A `Row` is one figure of a table with a note that explains it."""
 
     name: str
     spread: Spread
@@ -58,12 +58,12 @@ class Row:
 def time_interleaved(
     sides: Mapping[str, Callable[[], object]], rounds: int, device: torch.device | None = None
 ) -> dict[str, float]:
-    """Call several things in turn, round after round; the median of the seconds of each, a first call not counted.
+    """Call several functions in turn, round after round; return the median seconds of each, without a first call.
 
     Args:
-        sides: what to call, by name; in reversed order in every second round.
-        rounds: calls that count, at least one.
-        device: waited for before the clock is read; None or a CPU needs no waiting.
+        sides: functions by name, called in reversed order in every second round.
+        rounds: number of measured calls, at least one.
+        device: device to wait for before the clock is read; None or a CPU needs no waiting.
     """
     for call in sides.values():
         call()
@@ -83,6 +83,6 @@ def _seconds_of(call: Callable[[], object], device: torch.device | None) -> floa
 
 
 def _wait_for(device: torch.device | None) -> None:
-    """Wait until a graphics card has done what it was told; nothing on a CPU."""
+    """Wait until a graphics card has finished its work; do nothing on a CPU."""
     if device is not None and device.type == "cuda":
         torch.cuda.synchronize(device)

@@ -1,4 +1,4 @@
-"""What is refined: frames with cars."""
+"""This module loads the frames that are refined."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ _DETECTORS = {"rendered": "stereo", "kitti": "noisy_stereo"}
 
 @dataclass(frozen=True)
 class Scene:
-    """Frames of one data set, with at least one car each."""
+    """A `Scene` has the frames of one data set, with at least one car each."""
 
     name: str
     frames: tuple[LoadedFrame, ...]
 
 
 def load_scenes(data_root: Path | None, max_frames: int | None = None) -> tuple[Scene, ...]:
-    """The rendered and the KITTI frames below a data folder, or else the bundled demo frame.
+    """The rendered and the KITTI frames below a data folder, or the bundled demo frame without a folder.
 
     Args:
-        data_root: holds `rendered` or `kitti` (DIRECTSHAPE_DATA), or None.
-        max_frames: of each, the first; None for all.
+        data_root: folder with `rendered` or `kitti` (DIRECTSHAPE_DATA), or None.
+        max_frames: number of first frames of each data set; None for all.
 
     Raises:
-        InputError: the folder holds neither.
+        InputError: the folder has neither.
     """
     if data_root is None:
         return (demo_scene(),)
@@ -49,7 +49,7 @@ def _scene(root: Path, detector: str, max_frames: int | None) -> Scene:
     where = root, root / "detections" / detector, root / "training" / "masks"
     try:
         from directshape_torch.io.stereo_dataset import open_dataset
-    except ImportError:  # in an older version, which this one is compared with, a layout is a class
+    except ImportError:  # in an older version, which is compared with this one, a layout is a class
         from directshape_torch.io.kitti_dataset import KittiStereoDataset  # type: ignore[import-not-found]
 
         dataset = KittiStereoDataset(*where)

@@ -1,1 +1,1 @@
-"""Parts of `render_demo_scene.py`: a seeded street scene, its rendering, and its ground truth in KITTI's layout."""
+"""This package draws a seeded street scene, renders it, and writes its ground truth in KITTI's layout."""

@@ -1,7 +1,7 @@
-"""KITTI's stereo camera over a street.
+"""This module has KITTI's stereo camera over a street.
 
-Frames: `road` has x right, y down, z along the street and its ground at y = 0 under the left camera; `cam`, `right`,
-`ref` and `obj` as in CONVENTIONS.md. Pixels are (u, v), the centre of the top-left pixel is (0, 0).
+Frames are `road`, with x right, y down, z along the street and its ground at y = 0 under the left camera, and `cam`,
+`right`, `ref` and `obj` as in CONVENTIONS.md. Pixels are (u, v); the centre of the top-left pixel is (0, 0).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 IMAGE_WIDTH_PX, IMAGE_HEIGHT_PX = 1242, 375
 
-# The calibration of KITTI's most frequent rig (P0..P3 of its drives of 26 September 2011).
+# This is the calibration of KITTI's most frequent rig (P0..P3 of its drives of 26 September 2011).
 _FOCAL_PX, _CU_PX, _CV_PX = 721.5377, 609.5593, 172.854
 _FOURTH_COLUMNS = {
     "P0": (0.0, 0.0, 0.0),
@@ -32,22 +32,22 @@ def projection(name: str) -> Array:
 
 
 T_CAM_REF = np.linalg.solve(K, np.array(_FOURTH_COLUMNS["P2"]))
-"""`x_cam = x_ref + T_CAM_REF`, metres."""
+"""This is the offset in `x_cam = x_ref + T_CAM_REF`, metres."""
 T_RIGHT_REF = np.linalg.solve(K, np.array(_FOURTH_COLUMNS["P3"]))
 T_RIGHT_CAM = T_RIGHT_REF - T_CAM_REF
-"""`x_right = x_cam + T_RIGHT_CAM`: the baseline of 0.5327 m, and 2.7 mm vertically."""
+"""This is the offset in `x_right = x_cam + T_RIGHT_CAM`: the baseline of 0.5327 m, and 2.7 mm vertically."""
 
 
 @dataclass(frozen=True)
 class CameraPose:
-    """Where the left camera stands over the road: height in metres, pitch (nose down) and roll in radians."""
+    """A `CameraPose` is the pose of the left camera over the road; pitch is positive with the nose down."""
 
     height_m: float
     pitch_rad: float
     roll_rad: float
-    x_m: float = 0.0  # place on the road, metres
+    x_m: float = 0.0  # position on the road, metres
     z_m: float = 0.0
-    yaw_rad: float = 0.0  # where it looks, 0 along the street, positive to the right
+    yaw_rad: float = 0.0  # 0 along the street, positive to the right
 
     @property
     def T_cam_road(self) -> Array:
@@ -72,7 +72,7 @@ class CameraPose:
 
     @property
     def ground_plane_ref(self) -> Array:
-        """`(a, b, c, d)` with `a x + b y + c z + d = 0` in ref, the unit normal pointing up."""
+        """The plane `(a, b, c, d)` with `a x + b y + c z + d = 0` in ref, with the unit normal pointing up."""
         T = self.T_cam_road
         normal = T[:3, :3] @ np.array([0.0, -1.0, 0.0])
         offset_cam = -normal @ T[:3, 3]
@@ -85,6 +85,6 @@ def transform(T_b_a: Array, points_a: Array) -> Array:
 
 
 def project(points_cam: Array) -> Array:
-    """Pixels (N, 2) of points (N, 3) in front of a camera (left or right: KITTI's share K)."""
+    """Pixels (N, 2) of points (N, 3) in front of a camera (left or right, as KITTI's cameras share K)."""
     pixels = points_cam @ K.T
     return pixels[:, :2] / pixels[:, 2:]

@@ -1,4 +1,4 @@
-"""The surfaces of a parametric car: its mesh cut into parts, each with its own material."""
+"""This module cuts the mesh of a parametric car into parts, each with its own material."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from demo_scene.camera import Array, transform
 from demo_scene.layout import PlacedCar
 from demo_scene.surfaces import Indices, Material, Surface
 
-# One more part than `parametric_cars` knows: the gaps around doors, bonnet and tailgate.
+# These parts are not in `parametric_cars`; the first are the gaps around doors, bonnet and tailgate.
 _GAP = 100
 _TAIL_LIGHT = 101
 _SPOKE_GAP = 102
@@ -20,7 +20,7 @@ _SPLITS = 2
 
 @dataclass(frozen=True)
 class CarModel:
-    """A car's closed mesh in its object frame: vertices (N, 3), faces (M, 3), smooth normals (N, 3)."""
+    """A `CarModel` is a car's closed mesh in its object frame: vertices (N, 3), faces (M, 3), smooth normals (N, 3)."""
 
     vertices: Array
     faces: Indices
@@ -56,9 +56,9 @@ def car_surfaces(car: PlacedCar, model: CarModel, instance: int) -> list[Surface
 
 
 def _cut(car: PlacedCar, model: CarModel) -> tuple[Array, Array, Indices, Indices]:
-    """Split the triangles along part borders, so that borders run within a few millimetres of where they belong.
+    """Split the triangles along part borders, so that borders are accurate to a few millimetres.
 
-    The new vertices are midpoints of straight edges: the surface stays the same and stays closed.
+    The new vertices are midpoints of straight edges, so the surface is unchanged and stays closed.
     """
     vertices, normals, faces = model.vertices, model.normals, model.faces
     for _ in range(_SPLITS):
@@ -86,7 +86,7 @@ def _split(vertices: Array, normals: Array, faces: Indices, chosen: np.ndarray) 
 
 
 def part_labels(car: PlacedCar, points_obj: Array) -> Indices:
-    """Labels of `parametric_cars`, with panel gaps, tail lights and the spaces between spokes told apart."""
+    """Labels of `parametric_cars`, with separate labels for panel gaps, tail lights and the spaces between spokes."""
     p = car.parameters
     labels = cars.car_part_labels(p, points_obj)
     x, height, side = points_obj[:, 0], -points_obj[:, 1], np.abs(points_obj[:, 2])

@@ -1,4 +1,4 @@
-"""House fronts: brick or plaster with rows of windows, doors and shop fronts, as pictures of colour and roughness."""
+"""This module draws house fronts with windows, doors and shop fronts as pictures of colour and roughness."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _BRICKS = ((0.56, 0.30, 0.22), (0.48, 0.27, 0.20), (0.62, 0.44, 0.32))
 
 @dataclass
 class _Front:
-    """A front under construction: sRGB colour (H, W, 3) and roughness (H, W); row 0 is the eaves."""
+    """A `_Front` is a front under construction: sRGB colour (H, W, 3) and roughness (H, W); row 0 is the eaves."""
 
     color: Array
     roughness: Array
 
     def fill(self, left: float, bottom: float, width: float, height: float, rgb: Array, roughness: float) -> None:
-        """A rectangle, in metres from the front's lower left corner."""
+        """Fill a rectangle, in metres from the front's lower left corner."""
         rows = self.color.shape[0]
         u0, u1 = (max(round(x / TEXEL_M), 0) for x in (left, left + width))
         v0, v1 = (max(rows - round(y / TEXEL_M), 0) for y in (bottom + height, bottom))
@@ -36,7 +36,7 @@ class _Front:
 
 
 def facade(rng: np.random.Generator, width_m: float, height_m: float) -> Material:
-    """A front `width_m` wide with floors of about 3 m, drawn at random."""
+    """A random front `width_m` wide with floors of about 3 m."""
     rows, columns = round(height_m / TEXEL_M), round(width_m / TEXEL_M)
     wall = _brick_wall(rng, rows, columns) if rng.random() < 0.45 else _plaster_wall(rng, rows, columns)
     front = _Front(wall, np.full((rows, columns), 0.85))
@@ -68,7 +68,7 @@ def _plaster_wall(rng: np.random.Generator, rows: int, columns: int) -> Array:
 
 
 def _brick_wall(rng: np.random.Generator, rows: int, columns: int) -> Array:
-    """Bricks of 24 x 8 cm in running bond; each has its own shade."""
+    """A wall of bricks of 24 x 8 cm in running bond; each has its own shade."""
     base = np.array(_BRICKS[int(rng.integers(len(_BRICKS)))])
     along, up = (np.arange(columns) + 0.5) * TEXEL_M, (np.arange(rows) + 0.5) * TEXEL_M
     course = np.floor(up / 0.08).astype(int)
@@ -123,7 +123,7 @@ def _door(rng: np.random.Generator, front: _Front, middle: float) -> None:
 
 
 def _weather(rng: np.random.Generator, color: Array) -> None:
-    """Streaks of rain and a darker foot."""
+    """Add streaks of rain and a darker foot."""
     rows, columns = color.shape[:2]
     streaks = cv2.GaussianBlur(rng.standard_normal((rows, columns)), (0, 0), sigmaX=2.0, sigmaY=60.0)
     color *= (1.0 + 0.035 * streaks / streaks.std())[..., None]

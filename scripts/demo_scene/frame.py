@@ -1,4 +1,4 @@
-"""Frames from a seed: layout, surfaces, both views, exact masks, labels and detections."""
+"""This module renders frames from a seed: layout, surfaces, both views, exact masks, labels and detections."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from demo_scene.street import street
 from demo_scene.surfaces import Picture, Surface
 
 _RIGHT_GAIN_DEVIATION = 0.02
-# A car gets a label from this many visible pixels on, where all of it is this far before the camera.
+# A car gets a label if it has this many visible pixels, and all of it is this far in front of the camera.
 _FEWEST_PIXELS, _NEAREST_M = 300, 0.8
 
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """How much effort a frame gets."""
+    """A `RenderSettings` sets the effort for a frame."""
 
     paths_per_pixel: int = 16
     variant: str = "scalar_rgb"
 
 
 def render_frame(layout: SceneLayout, settings: RenderSettings) -> Frame:
-    """Render a scene; randomness comes from `layout.seed` alone."""
+    """Render a scene, with all randomness from `layout.seed`."""
     return next(render_sequence([layout], settings))
 
 
 def render_sequence(layouts: Sequence[SceneLayout], settings: RenderSettings) -> Iterator[Frame]:
-    """Render one scene at several times: the street and the cars' surfaces are made once."""
+    """Render one scene at several times; the street and the cars' surfaces are made once."""
     first = layouts[0]
     rngs = dict(zip(("street", "sky", "sensor", "detector"), _generators(first.seed, 4), strict=True))
     still, light = street(rngs["street"]), scene_light(rngs["sky"], first)
@@ -77,7 +77,7 @@ def _labels(
     truth: PixelTruth,
     variant: str,
 ) -> dict[int, CarLabel]:
-    """Of the cars in view, by their number."""
+    """Labels of the visible cars, by their number."""
     labels = {}
     for k, (car, model) in enumerate(zip(layout.cars, models, strict=True)):
         pixels = int((truth.instance == k).sum())
@@ -93,11 +93,11 @@ def scene_light(rng: np.random.Generator, layout: SceneLayout) -> Light:
     """Sky and sun of a scene."""
     elevation, azimuth = layout.sun_elevation_rad, layout.sun_azimuth_rad
     to_sun = np.array([np.cos(elevation) * np.sin(azimuth), -np.sin(elevation), np.cos(elevation) * np.cos(azimuth)])
-    # The sky map's frame is the road's turned by 180 degrees about x.
+    # The sky map's frame is the road's rotated by 180 degrees about x.
     to_sun_map = to_sun * np.array([1.0, -1.0, -1.0])
     return Light(sky_radiance(rng, to_sun_map), to_sun, (3.6, 3.3, 2.9))
 
 
 def _generators(seed: int, count: int) -> list[np.random.Generator]:
-    # Streams of their own: more detail in the street must not move the detections.
+    # Each part has its own stream, so that more detail in the street does not change the detections.
     return [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(count)]

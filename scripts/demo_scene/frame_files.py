@@ -1,4 +1,4 @@
-"""Writes frames in the folder layouts of KITTI's object and tracking benchmarks."""
+"""This module writes frames in the folder layouts of KITTI's object and tracking benchmarks."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _COCO_CAR = 3
 
 @dataclass(frozen=True)
 class Frame:
-    """All that is written of a frame; instance maps hold the number of the car, -1 elsewhere."""
+    """A `Frame` has everything that is written for a frame; instance maps have car numbers, and -1 elsewhere."""
 
     layout: SceneLayout
     image_left: Picture
     image_right: Picture
     instance_left: Indices
     instance_right: Indices
-    labels: dict[int, CarLabel]  # of the cars in view, by the car's number
+    labels: dict[int, CarLabel]  # of the visible cars, by the car's number
     detections: dict[int, CarLabel]
 
 
@@ -46,8 +46,8 @@ def write_frame(root: Path, name: str, frame: Frame) -> None:
 def write_sequence(root: Path, name: str, frames: Sequence[Frame], interval_s: float) -> None:
     """Write frames of one scene in the layout of KITTI's tracking benchmark; a car's number is its track.
 
-    Beside what a frame has: `poses/NAME.txt` (camera 0 of each frame in that of the first, rows of 12 as in KITTI's
-    odometry benchmark) and `times/NAME.txt` (seconds).
+    Further files are `poses/NAME.txt` (poses of camera 0 relative to the first frame, rows of 12 as in KITTI's odometry
+    benchmark) and `times/NAME.txt` (seconds).
     """
     training = root / "training"
     for number, frame in enumerate(frames):
@@ -64,7 +64,7 @@ def write_sequence(root: Path, name: str, frames: Sequence[Frame], interval_s: f
 
 
 def _write_views(root: Path, folders: tuple[str, str], stem: str, frame: Frame, when: dict[str, Any]) -> None:
-    """What every frame of either layout has: images, plane, masks and description."""
+    """Write the files of a frame that both layouts have: images, plane, masks and description."""
     training = root / "training"
     for folder, image in zip(folders, (frame.image_left, frame.image_right), strict=True):
         _write_png(training / folder / f"{stem}.png", image)
@@ -76,7 +76,7 @@ def _write_views(root: Path, folders: tuple[str, str], stem: str, frame: Frame, 
 
 
 def pose_lines(cameras: Sequence[CameraPose]) -> list[str]:
-    """`T_first_ref` of each camera 0, rows of 12 numbers."""
+    """Rows of 12 numbers of `T_first_ref` for each camera 0."""
     T_ref_cam = np.eye(4)
     T_ref_cam[:3, 3] = -T_CAM_REF
     T_ref_road = [T_ref_cam @ camera.T_cam_road for camera in cameras]
@@ -84,7 +84,7 @@ def pose_lines(cameras: Sequence[CameraPose]) -> list[str]:
 
 
 def calibration_text() -> str:
-    """KITTI's object calibration file; there is no laser scanner or IMU, so their rows are a mere change of axes."""
+    """KITTI's object calibration file; the rows of laser scanner and IMU, which do not exist, only change axes."""
     lines = [f"{name}: " + _numbers(projection(name).ravel()) for name in ("P0", "P1", "P2", "P3")]
     lines.append("R0_rect: " + _numbers(np.eye(3).ravel()))
     axes = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0]])
@@ -103,7 +103,7 @@ def _numbers(values: np.ndarray[Any, np.dtype[np.float64]]) -> str:
 
 
 def mask_entries(instance: Indices, side: str) -> list[dict[str, Any]]:
-    """COCO results, one for each car that has a pixel in the map; `instance_id` is 1000 + label line, from 1."""
+    """COCO results for each car with a pixel in the map; `instance_id` is 1000 + label line, from 1."""
     from pycocotools import mask as coco
 
     entries = []
@@ -123,7 +123,7 @@ def mask_entries(instance: Indices, side: str) -> list[dict[str, Any]]:
 
 
 def scene_description(layout: SceneLayout) -> dict[str, Any]:
-    """Seed, camera, sun, and of each car its exact pose, measures and paint."""
+    """Seed, camera, sun, and the exact pose, measures and paint of each car."""
     return {
         "seed": layout.seed,
         "camera_height_m": layout.camera.height_m,

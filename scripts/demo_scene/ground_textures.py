@@ -1,4 +1,4 @@
-"""Pictures of asphalt with markings, paving stones, kerb stones and grass, drawn with numpy and OpenCV."""
+"""This module draws asphalt with markings, paving stones, kerb stones and grass with numpy and OpenCV."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _WHITE = 0.80
 
 
 def road(rng: np.random.Generator, length_m: float) -> Picture:
-    """The carriageway from kerb to kerb, one texel a centimetre; row 0 is the far end, column 0 the left kerb."""
+    """The carriageway from kerb to kerb, texels of 1 cm; row 0 is the far end, column 0 the left kerb."""
     rows, columns = round(length_m / ROAD_TEXEL_M), round((RIGHT_KERB_M - LEFT_KERB_M) / ROAD_TEXEL_M)
     x = LEFT_KERB_M + (np.arange(columns) + 0.5) * ROAD_TEXEL_M
     z = length_m - (np.arange(rows) + 0.5) * ROAD_TEXEL_M
@@ -25,7 +25,7 @@ def road(rng: np.random.Generator, length_m: float) -> Picture:
     _patches(rng, grey)
     _cracks(rng, grey)
     _parking_strips(rng, grey, x, z)
-    # Aggregate: bright and dark stones of one to two centimetres.
+    # The aggregate has bright and dark stones of one to two centimetres.
     grey += 0.045 * rng.standard_normal(grey.shape) + 0.03 * smooth_noise(rng, rows, columns, 2.5)
     _markings(rng, grey, x, z)
     _manholes(rng, grey)
@@ -36,7 +36,7 @@ def road(rng: np.random.Generator, length_m: float) -> Picture:
 
 
 def _wear(grey: Array, x: Array) -> None:
-    """Polished wheel tracks and the oil line between them, in each lane."""
+    """Add polished wheel tracks, and the oil line between them, in each lane."""
     for centre in (0.0, -3.5):
         for track in (-0.75, 0.75):
             grey += 0.028 * np.exp(-0.5 * ((x - centre - track) / 0.22) ** 2)
@@ -44,7 +44,7 @@ def _wear(grey: Array, x: Array) -> None:
 
 
 def _patches(rng: np.random.Generator, grey: Array) -> None:
-    """Repaired rectangles, lighter or darker, with a seam of tar."""
+    """Add repaired rectangles, lighter or darker, with a seam of tar."""
     for _ in range(16):
         height, width = int(rng.uniform(120, 700)), int(rng.uniform(60, 260))
         top, left = int(rng.integers(0, grey.shape[0] - height)), int(rng.integers(230, grey.shape[1] - 230 - width))
@@ -54,7 +54,7 @@ def _patches(rng: np.random.Generator, grey: Array) -> None:
 
 
 def _cracks(rng: np.random.Generator, grey: Array) -> None:
-    """Meandering cracks, some filled with a broad band of tar."""
+    """Add meandering cracks, some filled with a broad band of tar."""
     for _ in range(60):
         steps = int(rng.integers(20, 90))
         heading = rng.uniform(0, 2 * np.pi) + np.cumsum(rng.normal(0, 0.35, steps))
@@ -66,7 +66,7 @@ def _cracks(rng: np.random.Generator, grey: Array) -> None:
 
 
 def _parking_strips(rng: np.random.Generator, grey: Array, x: Array, z: Array) -> None:
-    """Cobbles of 12 cm, in staggered rows, beside both lanes."""
+    """Add cobbles of 12 cm, in staggered rows, beside both lanes."""
     for columns in (np.flatnonzero(x < LEFT_LANE_M), np.flatnonzero(x > RIGHT_LANE_M)):
         stone = 0.12
         row = np.floor(z / stone).astype(int)
@@ -80,7 +80,7 @@ def _parking_strips(rng: np.random.Generator, grey: Array, x: Array, z: Array) -
 
 
 def _markings(rng: np.random.Generator, grey: Array, x: Array, z: Array) -> None:
-    """A dashed centre line, edge lines, the marks between parking bays, and an arrow's worth of wear on all of them."""
+    """Add a dashed centre line, edge lines and marks between parking bays, all of them worn."""
     painted = (np.abs(x - CENTRE_LINE_M) < 0.07)[None, :] & (np.mod(z, 6.0) < 3.0)[:, None]
     for edge in (LEFT_LANE_M, RIGHT_LANE_M):
         painted |= (np.abs(x - edge) < 0.06)[None, :]
@@ -102,7 +102,7 @@ def _manholes(rng: np.random.Generator, grey: Array) -> None:
 
 
 def _litter(rng: np.random.Generator, picture: Array) -> None:
-    """Fallen leaves, mostly along the kerbs."""
+    """Add fallen leaves, mostly along the kerbs."""
     rows, columns = picture.shape[:2]
     for _ in range(1500):
         from_kerb = rng.exponential(70.0)
@@ -114,7 +114,7 @@ def _litter(rng: np.random.Generator, picture: Array) -> None:
 
 
 def paving(rng: np.random.Generator, length_m: float, width_m: float) -> Picture:
-    """Concrete slabs of 40 cm with dark joints, stains and a few chewed-gum dots; one texel 1.5 cm."""
+    """Concrete slabs of 40 cm with dark joints, stains and a few chewed-gum dots; texels of 1.5 cm."""
     texel, slab = 0.015, 0.40
     rows, columns = round(length_m / texel), round(width_m / texel)
     across, along = (np.arange(columns) + 0.5) * texel, (np.arange(rows) + 0.5) * texel
@@ -129,7 +129,7 @@ def paving(rng: np.random.Generator, length_m: float, width_m: float) -> Picture
 
 
 def kerb(rng: np.random.Generator, length_m: float) -> Picture:
-    """Granite kerb stones of one metre; one texel 1 cm, 16 columns."""
+    """Granite kerb stones of one metre; texels of 1 cm, 16 columns."""
     rows = round(length_m / 0.01)
     stone = (np.arange(rows) // 100).astype(int)
     grey = rng.normal(0.62, 0.04, stone.max() + 1)[stone][:, None] + 0.06 * rng.standard_normal((rows, 16))
@@ -138,7 +138,7 @@ def kerb(rng: np.random.Generator, length_m: float) -> Picture:
 
 
 def grass(rng: np.random.Generator, length_m: float, width_m: float) -> Picture:
-    """Lawn; one texel 2 cm."""
+    """A lawn with texels of 2 cm."""
     rows, columns = round(length_m / 0.02), round(width_m / 0.02)
     tone = 0.10 * fractal_noise(rng, rows, columns, 120.0, 2.0) + 0.10 * rng.standard_normal((rows, columns))
     dry = np.clip(0.5 + 0.3 * fractal_noise(rng, rows, columns, 150.0, 15.0), 0.0, 1.0)[..., None]

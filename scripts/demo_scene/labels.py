@@ -1,4 +1,4 @@
-"""Ground truth and simulated detections as lines of KITTI's label and result files."""
+"""This module writes ground truth and simulated detections as lines of KITTI's label and result files."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ from demo_scene.camera import (
 from demo_scene.layout import PlacedCar
 
 _MEAN_HWL_M = np.array([1.53, 1.63, 3.88])
-# Standard deviations of a stereo detector: shares of depth along the viewing ray and of sizes, metres, degrees, pixels.
+# These are standard deviations of a stereo detector: shares of depth along the viewing ray and of sizes, metres,
+# degrees, pixels.
 _DEPTH_SHARE, _SIZE_SHARE, _LATERAL_M, _VERTICAL_M, _YAW_DEG, _BOX_PX = 0.025, 0.03, 0.12, 0.05, 5.0, 1.0
 
 
 @dataclass(frozen=True)
 class CarLabel:
-    """One line: `truncated` a share, `occluded` 0 to 3, box in pixels, sizes and `location_ref` in metres."""
+    """A `CarLabel` is one line: `truncated` a share, `occluded` 0 to 3, box in pixels, sizes and position in metres."""
 
     truncated: float
     occluded: int
@@ -41,12 +42,12 @@ class CarLabel:
 
 
 def wrap_angle(angle_rad: float) -> float:
-    """The same angle in [-pi, pi)."""
+    """The angle wrapped to [-pi, pi)."""
     return float(np.mod(angle_rad + np.pi, 2 * np.pi) - np.pi)
 
 
 def occlusion_level(visible_share: float) -> int:
-    """KITTI's 0 fully visible, 1 partly, 2 largely hidden."""
+    """KITTI's level for a visible share: 0 fully visible, 1 partly, 2 largely hidden."""
     return 0 if visible_share > 0.9 else 1 if visible_share > 0.5 else 2
 
 
@@ -76,7 +77,7 @@ def _area(box: Array) -> float:
 
 
 def noisy_detection(rng: np.random.Generator, truth: CarLabel) -> CarLabel:
-    """The label as a stereo detector might find it: wrong in depth, place, heading and size."""
+    """The label with the errors of a stereo detector in depth, position, heading and size."""
     x, y, z = np.array(truth.location_ref) * (1.0 + _DEPTH_SHARE * rng.standard_normal())
     h, w, length = _MEAN_HWL_M * (1.0 + _SIZE_SHARE * rng.standard_normal(3))
     limits = np.array([IMAGE_WIDTH_PX - 1, IMAGE_HEIGHT_PX - 1] * 2)
@@ -92,12 +93,12 @@ def noisy_detection(rng: np.random.Generator, truth: CarLabel) -> CarLabel:
 
 
 def label_line(label: CarLabel) -> str:
-    """15 columns of a label file."""
+    """The 15 columns of a label file."""
     return f"Car {label.truncated:.2f} {label.occluded:d} {_tail(label)}"
 
 
 def result_line(label: CarLabel, score: float) -> str:
-    """16 columns of a result file; truncation and occlusion are unknown to a detector."""
+    """The 16 columns of a result file; a detector does not know truncation and occlusion."""
     return f"Car -1 -1 {_tail(label)} {score:.4f}"
 
 

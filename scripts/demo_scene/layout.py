@@ -1,4 +1,4 @@
-"""Where the cars of a scene stand and what they look like: everything random about a scene but its textures."""
+"""This module draws all random values of a scene except its textures: poses and looks of cars, camera, sun."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from parametric_cars.measures import CarParameters, sample_car
 
 from demo_scene.camera import Array, CameraPose, project, transform
 
-# Lateral measures of the street, metres in the road frame; traffic keeps to the right.
+# These are lateral measures of the street, metres in the road frame; traffic keeps to the right.
 LEFT_KERB_M, LEFT_LANE_M, CENTRE_LINE_M, RIGHT_LANE_M, RIGHT_KERB_M = -7.55, -5.3, -1.75, 1.75, 4.0
 EGO_LANE_M, ONCOMING_LANE_M, PARKED_RIGHT_M, PARKED_LEFT_M = 0.0, -3.5, 2.93, -6.5
 
 _BODY_TYPES = ("city", "hatchback", "saloon", "estate", "suv", "van", "coupe")
 _BODY_TYPE_SHARES = (0.12, 0.28, 0.18, 0.16, 0.12, 0.07, 0.07)
-# Linear RGB and metallic share of paints seen in European streets.
+# These are linear RGB and metallic share of paints on European streets.
 _PAINTS = (
     ((0.62, 0.62, 0.60), 0.0),
     ((0.40, 0.41, 0.42), 0.6),
@@ -32,7 +32,7 @@ _PAINTS = (
 
 @dataclass(frozen=True)
 class PlacedCar:
-    """A car in the street: its measures, its pose `T_road_obj` (4, 4), paint (linear RGB) and metallic share."""
+    """A `PlacedCar` is a car in the street: measures, pose `T_road_obj` (4, 4), paint (linear RGB), metallic share."""
 
     parameters: CarParameters
     T_road_obj: Array
@@ -42,7 +42,7 @@ class PlacedCar:
 
 @dataclass(frozen=True)
 class SceneLayout:
-    """A scene but its textures: camera, cars, and the sun's elevation and azimuth (from ahead to the right)."""
+    """A `SceneLayout` is a scene without textures; the azimuth of the sun is from ahead to the right."""
 
     seed: int
     camera: CameraPose
@@ -52,7 +52,7 @@ class SceneLayout:
 
 
 def pose_on_road(x_m: float, z_m: float, rotation_y_rad: float) -> Array:
-    """`T_road_obj` (4, 4) of a car on the ground, heading by KITTI's `rotation_y` (-pi/2 drives away).
+    """`T_road_obj` (4, 4) of a car on the ground with heading by KITTI's `rotation_y` (-pi/2 drives away).
 
     Examples:
         >>> bool(np.allclose(pose_on_road(0.0, 9.0, -np.pi / 2)[:3, 0], [0.0, 0.0, 1.0]))
@@ -66,7 +66,7 @@ def pose_on_road(x_m: float, z_m: float, rotation_y_rad: float) -> Array:
 
 
 def sample_layout(seed: int, num_cars: int | None = None) -> SceneLayout:
-    """Draw a scene of 4 to 6 cars, at least one partly hidden and none nearly hidden; the same seed, the same scene."""
+    """Draw a scene of 4 to 6 cars, at least one partly and none nearly hidden; equal seeds give equal scenes."""
     rng = np.random.default_rng(seed)
     count = int(rng.integers(4, 7)) if num_cars is None else num_cars
     camera = draw_camera(rng)
@@ -80,7 +80,7 @@ def sample_layout(seed: int, num_cars: int | None = None) -> SceneLayout:
 
 
 def draw_camera(rng: np.random.Generator) -> CameraPose:
-    """KITTI's camera on its car, which leans a little."""
+    """KITTI's camera with a small random pitch and roll."""
     return CameraPose(
         height_m=float(rng.normal(1.65, 0.02)),
         pitch_rad=float(np.radians(rng.normal(0.4, 0.3))),
@@ -89,13 +89,13 @@ def draw_camera(rng: np.random.Generator) -> CameraPose:
 
 
 def draw_sun(rng: np.random.Generator) -> tuple[float, float]:
-    """Elevation and azimuth in radians."""
+    """Random elevation and azimuth in radians."""
     elevation = float(np.radians(rng.uniform(36.0, 55.0)))
     return elevation, float(np.radians(rng.uniform(110.0, 160.0) * rng.choice([-1.0, 1.0])))
 
 
 def _draw_poses(rng: np.random.Generator, count: int) -> list[Array]:
-    """One car ahead, one oncoming, the others parked on both sides in slots of 6 m that no two share."""
+    """Poses with one car ahead, one oncoming, and the others parked on both sides in separate slots of 6 m."""
     away, towards = -0.5 * np.pi, 0.5 * np.pi
     poses = [
         pose_on_road(EGO_LANE_M + rng.normal(0, 0.15), rng.uniform(11.5, 20.0), away + rng.normal(0, 0.03)),
@@ -103,7 +103,7 @@ def _draw_poses(rng: np.random.Generator, count: int) -> list[Array]:
     ]
     right_slots = [("right", z) for z in np.arange(9.0, 33.0, 6.0) + rng.uniform(-0.3, 1.2)]
     left_slots = [("left", z) for z in np.arange(11.5, 33.0, 6.0) + rng.uniform(0.0, 1.5)]
-    # One car stands in the nearest slot at the right: it is the largest in the picture.
+    # One car stands in the nearest slot on the right, so it is the largest in the picture.
     later_slots = right_slots[1:] + left_slots
     order = rng.permutation(len(later_slots))
     for side, z in [right_slots[0], *(later_slots[k] for k in order)][: count - 2]:
@@ -114,7 +114,7 @@ def _draw_poses(rng: np.random.Generator, count: int) -> list[Array]:
 
 
 def dress(rng: np.random.Generator, T_road_obj: Array) -> PlacedCar:
-    """A car of the traffic drawn at random, at this pose."""
+    """A random car of the traffic, at this pose."""
     parameters = sample_car(rng, str(rng.choice(_BODY_TYPES, p=_BODY_TYPE_SHARES)))
     paint, metallic = _PAINTS[int(rng.integers(len(_PAINTS)))]
     shade = rng.uniform(0.85, 1.15)
@@ -129,7 +129,7 @@ def box_corners_obj(length_m: float, width_m: float, height_m: float) -> Array:
 
 
 def visible_column_shares(camera: CameraPose, cars: tuple[PlacedCar, ...]) -> Array:
-    """For each car, the share of its box's image columns that no nearer car's box covers: occlusion at a glance."""
+    """Share of each car's image columns, by its box, that no nearer car's box covers; it estimates occlusion."""
     spans, depths = [], []
     for car in cars:
         p = car.parameters

@@ -1,4 +1,4 @@
-"""Moving scenes: where the camera and every car are at each time, for rendered sequences."""
+"""This module moves the camera and every car of a scene, for rendered sequences."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ _STEP_S = 0.005
 
 @dataclass(frozen=True)
 class Drive:
-    """A drive on the ground at constant speed: start in metres, KITTI's `rotation_y`, and turns one after the other."""
+    """A `Drive` is a drive on the ground at constant speed: start in metres, KITTI's `rotation_y`, and turns."""
 
     x_m: float
     z_m: float
     rotation_y: float
     speed_m_s: float = 0.0
-    # `(duration_s, rate_rad_s)`, positive to the right; straight on after the last.
+    # Turns are `(duration_s, rate_rad_s)`, positive to the right; the drive is straight after the last turn.
     turns: tuple[tuple[float, float], ...] = ()
 
     def at(self, time_s: float) -> tuple[float, float, float]:
-        """Place x, z in metres and `rotation_y`.
+        """Position x, z in metres and `rotation_y` at a time.
 
         Examples:
             >>> [round(n, 3) for n in Drive(0.0, 5.0, -np.pi / 2, 10.0).at(0.5)]
@@ -54,7 +54,7 @@ class Drive:
 
 
 def sample_sequence(seed: int, num_frames: int, interval_s: float) -> list[SceneLayout]:
-    """A scene at `num_frames` times; cars keep their number. Kinds of traffic take turns with the seed."""
+    """A scene at `num_frames` times; cars keep their numbers. The kind of traffic depends on the seed in turn."""
     rng = np.random.default_rng(seed)
     camera, sun = draw_camera(rng), draw_sun(rng)
     kind = _KINDS[seed % len(_KINDS)]
@@ -77,7 +77,7 @@ def _moved(camera: CameraPose, ego: Drive, time_s: float) -> CameraPose:
 
 
 def _collide(drives: list[Drive], times: list[float]) -> bool:
-    """Whether two cars touch, each three discs of 1.05 m along its length."""
+    """Whether two cars touch, each modelled by three discs of 1.05 m along its length."""
     for time_s in times:
         discs = [_discs(d, time_s) for d in drives]
         for k, first in enumerate(discs):
@@ -94,7 +94,7 @@ def _discs(drive: Drive, time_s: float) -> Array:
 
 
 def _change_lane(side_m: float, speed_m_s: float, wait_s: float) -> tuple[tuple[float, float], ...]:
-    """To the right by `side_m` (negative: left) within about two seconds: a bend and its opposite."""
+    """Turns that move by `side_m` to the right (negative: left) within about two seconds: a bend and its opposite."""
     rate = side_m / speed_m_s
     return (wait_s, 0.0), (1.0, rate), (1.0, -rate)
 
@@ -106,7 +106,7 @@ def _parked(rng: np.random.Generator, z_m: float, side: str) -> Drive:
 
 
 def _passing_parked(rng: np.random.Generator) -> tuple[Drive, list[Drive]]:
-    """We drive past parked cars, which hide each other, and behind another."""
+    """Traffic in which the camera passes parked cars, which hide each other, behind a car."""
     ego = Drive(EGO_LANE_M, 0.0, _AWAY, rng.uniform(3.5, 4.5))
     ahead = Drive(EGO_LANE_M + rng.normal(0, 0.15), rng.uniform(14.0, 18.0), _AWAY, rng.uniform(4.0, 6.0))
     near, far = rng.uniform(13.5, 15.0), rng.uniform(17.0, 19.0)
@@ -114,7 +114,7 @@ def _passing_parked(rng: np.random.Generator) -> tuple[Drive, list[Drive]]:
 
 
 def _turning(rng: np.random.Generator) -> tuple[Drive, list[Drive]]:
-    """The car ahead turns round to the left, before an oncoming one and parked ones."""
+    """Traffic in which the car ahead turns round to the left, in front of an oncoming car and parked ones."""
     ego = Drive(EGO_LANE_M, 0.0, _AWAY, rng.uniform(0.5, 2.0))
     speed, radius = rng.uniform(3.8, 4.6), rng.uniform(4.0, 4.8)
     turns = ((0.3, 0.0), (rng.uniform(2.2, 2.8), -speed / radius))
@@ -124,7 +124,7 @@ def _turning(rng: np.random.Generator) -> tuple[Drive, list[Drive]]:
 
 
 def _overtaking(rng: np.random.Generator) -> tuple[Drive, list[Drive]]:
-    """One car overtakes another on the left and cuts in, and hides it for a while; we drive behind."""
+    """Traffic in which a car ahead overtakes another on the left, cuts in and hides it for a while."""
     ego = Drive(EGO_LANE_M, 0.0, _AWAY, rng.uniform(6.0, 7.0))
     slow, fast = rng.uniform(5.0, 6.0), rng.uniform(10.0, 11.0)
     slower = Drive(EGO_LANE_M + rng.uniform(0.4, 0.7), rng.uniform(15.0, 16.5), _AWAY, slow)
@@ -133,7 +133,7 @@ def _overtaking(rng: np.random.Generator) -> tuple[Drive, list[Drive]]:
 
 
 def _pulling_out(rng: np.random.Generator) -> tuple[Drive, list[Drive]]:
-    """A parked car pulls out before us, an oncoming one turns across the road, both in bends."""
+    """Traffic in which a parked car pulls out ahead and an oncoming one turns across the road, both in bends."""
     ego = Drive(EGO_LANE_M, 0.0, _AWAY, rng.uniform(2.0, 3.0), ((1.0, 0.0), (1.5, rng.uniform(0.02, 0.06))))
     out = rng.uniform(3.2, 4.0)
     leaving = Drive(PARKED_RIGHT_M - 0.3, rng.uniform(9.5, 11.0), _AWAY - 0.15, out, ((0.8, -0.45), (1.2, 0.5)))

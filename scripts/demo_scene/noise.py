@@ -1,4 +1,4 @@
-"""Smooth and fractal random fields, the stuff of all textures."""
+"""This module makes the smooth and fractal random fields of all textures."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def smooth_noise(rng: np.random.Generator, height: int, width: int, cell_px: flo
 
 
 def fractal_noise(rng: np.random.Generator, height: int, width: int, largest_px: float, smallest_px: float) -> Array:
-    """Sum of smooth noises, each of half the cell and 0.7 times the height of the one before; deviation 1."""
+    """Sum of smooth noises, each with half the cell and 0.7 times the amplitude of the previous one; deviation 1."""
     total, amplitude, cell = np.zeros((height, width)), 1.0, largest_px
     while cell >= smallest_px:
         total += amplitude * smooth_noise(rng, height, width, cell)

@@ -1,4 +1,4 @@
-"""Trees and hedges made of loose leaves."""
+"""This module makes trees and hedges of loose leaves."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def tree(rng: np.random.Generator, x_m: float, z_m: float, height_m: float) -> l
 
 
 def hedge(rng: np.random.Generator, low: Array, high: Array) -> Surface:
-    """Leaves filling a box's outer 25 cm; denser than trees so that nothing shows through."""
+    """Leaves that fill a box's outer 25 cm, denser than in trees so that nothing is visible through them."""
     count = int(1600 * (high[2] - low[2]))
     points = rng.uniform(low, high, (count, 3))
-    # Push towards the street-facing side and the top, the only sides that a driver sees.
+    # Points are moved to the street-facing side and the top, the only sides that a driver sees.
     points[: count // 2, 1] = low[1] + np.abs(rng.normal(0, 0.06, count // 2))
     green = np.array([0.05, 0.13, 0.03]) * rng.uniform(0.8, 1.2)
     return _leaves(rng, points, rng.uniform(0.05, 0.09, count), green)
@@ -47,7 +47,7 @@ def _in_ball(rng: np.random.Generator, count: int) -> Array:
 
 
 def _leaves(rng: np.random.Generator, centres: Array, sizes: Array, green: Array) -> Surface:
-    """One rhombus a leaf, in any direction; its colour varies from leaf to leaf."""
+    """One rhombus for each leaf, in a random direction; the colour varies between leaves."""
     count = len(centres)
     along = rng.standard_normal((count, 3))
     along /= np.linalg.norm(along, axis=1, keepdims=True)

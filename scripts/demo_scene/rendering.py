@@ -1,7 +1,7 @@
-"""Path tracing of a scene with Mitsuba 3, and the exact instance and depth maps at the pixel centres.
+"""This module renders a scene by path tracing with Mitsuba 3, with exact instance and depth maps at pixel centres.
 
-Needs the extra `render` (mitsuba, pyoidn). The variant `scalar_rgb` runs as installed; `llvm_ad_rgb` is faster and
-needs an LLVM library of version 19 (Debian: `apt-get install libllvm19`); older ones crash.
+It needs the extra `render` (mitsuba, pyoidn). The variant `scalar_rgb` runs as installed; `llvm_ad_rgb` is faster and
+needs an LLVM library of version 19 (Debian: `apt-get install libllvm19`), because older ones crash.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _MAX_INSTANCES = 64
 
 @dataclass(frozen=True)
 class Light:
-    """The sky's radiance map, the unit direction (3,) towards the sun in the road frame, and the sun's irradiance."""
+    """A `Light` has the sky's radiance map, the unit direction (3,) to the sun in the road frame, its irradiance."""
 
     sky_radiance: Array
     direction_to_sun: Array
@@ -31,7 +31,7 @@ class Light:
 
 @dataclass(frozen=True)
 class PathTraced:
-    """Linear radiance, albedo and normals (H, W, 3) of one view, noisy."""
+    """A `PathTraced` has linear radiance, albedo and normals (H, W, 3) of one view, with noise."""
 
     radiance: Array
     albedo: Array
@@ -40,17 +40,17 @@ class PathTraced:
 
 @dataclass(frozen=True)
 class PixelTruth:
-    """What the ray through each pixel's centre meets first."""
+    """A `PixelTruth` says what the ray through each pixel's centre hits first."""
 
     instance: Indices  # (H, W) number of the car, -1 for the street and the sky
     depth_m: Array  # (H, W) distance along the optical axis, 0 for the sky
 
 
 def import_mitsuba() -> Any:
-    """The renderer.
+    """The renderer's module.
 
     Raises:
-        MissingDependencyError: it is not installed.
+        MissingDependencyError: Mitsuba is not installed.
     """
     try:
         return importlib.import_module("mitsuba")
@@ -59,10 +59,10 @@ def import_mitsuba() -> Any:
 
 
 class Renderer:
-    """Mitsuba with one scene loaded.
+    """A `Renderer` is Mitsuba with one loaded scene.
 
     Args:
-        surfaces: everything that is seen.
+        surfaces: all visible surfaces.
         light: sky and sun for `path_trace`; None for `pixel_truth`, where materials do not matter.
         variant: Mitsuba's variant.
     """
@@ -80,7 +80,7 @@ class Renderer:
         self._scene = mitsuba.load_dict(description, optimize=False)
 
     def path_trace(self, T_view_road: Array, paths_per_pixel: int, seed: int) -> PathTraced:
-        """Radiance seen by a camera, and what the denoiser wants to know."""
+        """Radiance seen by a camera, with the albedo and normals that the denoiser needs."""
         integrator = {
             "type": "aov",
             "aovs": "albedo:albedo,normal:sh_normal",
@@ -92,9 +92,9 @@ class Renderer:
         return PathTraced(radiance, np.clip(channels[..., -6:-3], 0.0, 1.0), channels[..., -3:])
 
     def pixel_truth(self, T_view_road: Array) -> PixelTruth:
-        """Instance and depth where the rays through the pixel centres arrive."""
+        """Instance and depth at the first hits of the rays through the pixel centres."""
         integrator = {"type": "aov", "aovs": "instance:albedo,position:position"}
-        # One stratified sample without jitter lies in the middle of its pixel.
+        # One stratified sample without jitter is at the centre of its pixel.
         sampler = {"type": "stratified", "sample_count": 1, "jitter": False}
         channels = self._render(T_view_road, integrator, sampler, 0)
         instance = np.rint(channels[..., -6] * _MAX_INSTANCES).astype(np.int64) - 1
@@ -118,8 +118,8 @@ class Renderer:
             "near_clip": 0.05,
             "far_clip": 1000.0,
             "to_world": self._mi.ScalarTransform4f(to_world),
-            # The film's continuous coordinates put the centre of the first pixel at 0.5, ours at 0;
-            # its axes point left and up.
+            # The film's continuous coordinates have the centre of the first pixel at 0.5, ours at 0; its axes point
+            # left and up.
             "principal_point_offset_x": float((0.5 * IMAGE_WIDTH_PX - K[0, 2] - 0.5) / IMAGE_WIDTH_PX),
             "principal_point_offset_y": float((0.5 * IMAGE_HEIGHT_PX - K[1, 2] - 0.5) / IMAGE_HEIGHT_PX),
             "film": {
@@ -134,7 +134,7 @@ class Renderer:
         }
 
     def _lights(self, light: Light) -> dict[str, Any]:
-        # The map's own up is +y, the road's is -y.
+        # The map has +y up, the road -y.
         upright = self._mi.ScalarTransform4f().rotate([1, 0, 0], 180.0)
         bitmap = self._mi.Bitmap(light.sky_radiance.astype(np.float32))
         sun = {
@@ -172,7 +172,7 @@ class Renderer:
 
     def _bsdf(self, surface: Surface) -> dict[str, Any]:
         if self._shows_instances:
-            # The car's number as a grey: shape indices count all scenes of the process, albedo is the surface's own.
+            # The car's number is a grey albedo, because shape indices count all scenes of the process.
             grey = (surface.instance + 1) / _MAX_INSTANCES
             reflectance = {"type": "rgb", "value": [grey, grey, grey]}
             return {"type": "twosided", "material": {"type": "diffuse", "reflectance": reflectance}}

@@ -1,4 +1,4 @@
-"""From noisy linear radiance to the bytes of a camera: denoising, exposure, tone curve, gain and sensor noise."""
+"""This module turns noisy linear radiance into camera images: denoising, exposure, tone curve, gain, sensor noise."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def denoise(view: PathTraced) -> Array:
     """Radiance (H, W, 3) without path-tracing noise, by Open Image Denoise.
 
     Raises:
-        MissingDependencyError: it is not installed.
+        MissingDependencyError: Open Image Denoise is not installed.
     """
     try:
         import pyoidn
@@ -30,7 +30,7 @@ def denoise(view: PathTraced) -> Array:
 
 
 def exposure_for(radiance: Array) -> float:
-    """Factor that brings the street, the lower half of the picture, to a middle grey."""
+    """Factor that brings the street, the lower half of the picture, to a medium grey."""
     luminance = radiance[len(radiance) // 2 :] @ np.array([0.299, 0.587, 0.114])
     return 0.19 / max(float(np.median(luminance)), 1e-6)
 

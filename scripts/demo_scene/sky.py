@@ -1,4 +1,4 @@
-"""A sky of thin clouds as a latitude-longitude radiance map; the sun itself is a separate light."""
+"""This module makes a sky of thin clouds as a latitude-longitude radiance map; the sun is a separate light."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def sky_radiance(rng: np.random.Generator, sun_direction_up: Array, width: int =
     height = width // 2
     polar = (np.arange(height) + 0.5) / height * np.pi
     azimuth = (np.arange(width) + 0.5) / width * 2 * np.pi
-    # The renderer's convention: u = 0 looks along +z, u grows towards +x... mirrored, as `atan2(x, -z)`.
+    # In the renderer's convention u = 0 looks along +z and u grows towards +x, mirrored, as in `atan2(x, -z)`.
     direction = np.stack(
         [
             np.sin(polar)[:, None] * np.sin(azimuth)[None, :],
@@ -42,7 +42,7 @@ def sky_radiance(rng: np.random.Generator, sun_direction_up: Array, width: int =
 
 
 def _cloud_cover(rng: np.random.Generator, direction: Array) -> Array:
-    """Clouds on a flat layer: seen from below they grow towards the zenith and crowd at the horizon."""
+    """Clouds on a flat layer, which grow towards the zenith and crowd at the horizon."""
     size = 1024
     layer = fractal_noise(rng, size, size, 180.0, 3.0)
     height = np.clip(direction[..., 1], 0.04, None)

@@ -1,4 +1,4 @@
-"""The street without its cars: carriageway, kerbs, pavements, houses, trees, hedges, lamps and signs."""
+"""This module makes the street without cars: carriageway, kerbs, pavements, houses, trees, hedges, lamps, signs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _ROOF = Material((0.17, 0.07, 0.05), roughness=0.8)
 
 
 def street(rng: np.random.Generator) -> list[Surface]:
-    """All surfaces of a street drawn at random, in the road frame."""
+    """All surfaces of a random street, in the road frame."""
     surfaces = _carriageway(rng)
     for side in (-1, 1):
         surfaces += _roadside(rng, side)
@@ -29,7 +29,7 @@ def street(rng: np.random.Generator) -> list[Surface]:
 
 
 def _along(x0: float, x1: float, y: float, z0: float, z1: float, material: Material) -> Surface:
-    """A level rectangle; its texture's last row lies at z0."""
+    """A level rectangle; the last row of its texture is at z0."""
     return quad(np.array([x0, y, z0]), np.array([x1 - x0, 0.0, 0.0]), np.array([0.0, 0.0, z1 - z0]), material)
 
 
@@ -124,7 +124,7 @@ def _lamp(foot: Array, side: int) -> list[Surface]:
 
 
 def _sign(rng: np.random.Generator, foot: Array) -> list[Surface]:
-    """A round traffic sign that faces the driver, red rim or blue."""
+    """A round traffic sign that faces the driver, with a red rim or blue."""
     surfaces = [tube(foot, foot + np.array([0.0, -2.6, 0.0]), 0.03, 0.03, _STEEL)]
     blue = rng.random() < 0.5
     rings = [(0.30, (0.02, 0.08, 0.45) if blue else (0.55, 0.02, 0.02)), (0.21, (0.7, 0.7, 0.7))]
@@ -140,7 +140,7 @@ def _sign(rng: np.random.Generator, foot: Array) -> list[Surface]:
 
 
 def _street_end(rng: np.random.Generator) -> list[Surface]:
-    """The house and trees where the street ends, so that no horizon shows."""
+    """The house and trees at the end of the street, which hide the horizon."""
     front = quad(np.array([-16.0, 0.0, _FAR_M]), np.array([28.0, 0.0, 0.0]), np.array([0.0, -9.7, 0.0]),
                  facade(rng, 28.0, 9.7))  # fmt: skip
     surfaces = [front]

@@ -1,4 +1,4 @@
-"""What a renderer is given: triangle meshes in the road frame, each with one material."""
+"""This module has the renderer's input: triangle meshes in the road frame, each with one material."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Material:
-    """A glossy or matt surface."""
+    """A `Material` is a glossy or matt surface."""
 
     # Linear RGB, an sRGB picture (H, W, 3), or None for the mesh's own vertex colours.
     base_color: tuple[float, float, float] | Picture | None
@@ -27,7 +27,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Surface:
-    """A mesh: vertices (N, 3) in the road frame, faces (M, 3), and what else the material asks for."""
+    """A `Surface` is a mesh: vertices (N, 3) in the road frame, faces (M, 3), and inputs of the material."""
 
     vertices: Array
     faces: Indices

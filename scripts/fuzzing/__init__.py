@@ -1,1 +1,1 @@
-"""Odd calls, damaged files, killed and faulty runs in numbers (`scripts/fuzz.py`)."""
+"""This package counts outcomes of odd calls, damaged files, and killed and faulty runs (`scripts/fuzz.py`)."""

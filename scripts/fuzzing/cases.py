@@ -1,4 +1,4 @@
-"""Odd calls and damaged files, in child processes: what crashes, hangs or eats memory ends with its child alone."""
+"""This module runs odd calls and damaged files in child processes, which contain crashes, hangs and memory use."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ import torch
 from directshape_torch.errors import DirectShapeError
 
 OUTCOMES = ("accepted", "refused", "foreign exception", "silent NaN", "crash", "hang", "over memory")
-# Above what the process has mapped before its first case.
+# This is the limit above the mapped memory of the process before its first case.
 BUDGET_BYTES = 2**31
 _NO_MEMORY = ("allocate memory", "not enough memory", "insufficient memory", "cannot allocate")
-# A child reads its samples first.
+# A child reads its samples before it answers.
 _PATIENCE_AT_START_S = 1800.0
 
 Case = Callable[[random.Random], tuple[str, Callable[[], bool]]]
-"""Draws one case: its name, and what does it and says whether all is finite that must be."""
+"""A case draws its name, and a function that runs it and says whether all values are finite that must be."""
 
 
 def answer(case: Case, seed: int) -> dict[str, Any]:
-    """How a case ended, and where it was raised what should not have been."""
+    """The outcome of a case, and the place of an error that should not have been raised."""
     name, act = case(random.Random(seed))
     outcome, said = "accepted", ""
     try:
@@ -46,7 +46,7 @@ def answer(case: Case, seed: int) -> dict[str, Any]:
 
 
 def serve(kind: str, pipe: Connection) -> None:
-    """The life of a child: answers seeds until the pipe ends."""
+    """Run a child: answer seeds until the pipe ends."""
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     for stream in (1, 2):
@@ -103,14 +103,14 @@ def _damaged_files(folder: Path) -> Case:
 
 
 def _where(error: Exception) -> str:
-    """The error and the last place of the package on its way."""
+    """The error and the last place of the package in its traceback."""
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if "/directshape_torch/" in frame.filename]
     place = f" at {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
     return f"{type(error).__name__}{place}: {str(error)[:200]}"
 
 
 class _Child:
-    """A process that answers seeds."""
+    """A `_Child` is a process that answers seeds."""
 
     def __init__(self, kind: str) -> None:
         context = multiprocessing.get_context("spawn")
@@ -123,7 +123,7 @@ class _Child:
         self._pipe.recv()
 
     def ask(self, seed: int, timeout_s: float) -> dict[str, Any]:
-        """Its answer, or that there was none; then it has ended."""
+        """The answer of the child, or a report of its crash or hang, after which it has ended."""
         outcome, said = "hang", f"{timeout_s:g} s"
         try:
             self._pipe.send(seed)
@@ -142,7 +142,7 @@ class _Child:
 
 
 def tally(kind: str, seeds: Iterable[int], timeout_s: float, report: Callable[[str], None]) -> dict[str, Any]:
-    """How many cases of these seeds ended how, and what was `found`: those that ended as none should."""
+    """Numbers of outcomes over the seeds, and the findings: cases whose outcome is not allowed."""
     child, counts, found = _Child(kind), Counter[str](), []
     for number, seed in enumerate(seeds, start=1):
         said = child.ask(seed, timeout_s)

@@ -1,4 +1,4 @@
-"""Runs whose disk fails at every n-th write and rename, or whose output folder goes; the next one goes on."""
+"""This module runs with a disk that fails at every n-th write and rename, or without its output folder, and resumes."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ ERRORS = (errno.ENOSPC, errno.EIO)
 
 
 class _FaultyDisk:
-    """Counts the writes and renames below a folder, and lets one of them fail.
+    """A `_FaultyDisk` counts the writes and renames below a folder, and lets one of them fail.
 
     Args:
-        folder: whose files are meant.
-        fails_at: number of the operation, from 0; None for none.
-        number: of the error.
+        folder: folder of the files.
+        fails_at: number of the operation that fails, from 0; None for none.
+        number: number of the error.
     """
 
     def __init__(self, folder: Path, fails_at: int | None, number: int) -> None:
@@ -37,7 +37,7 @@ class _FaultyDisk:
         self.count = 0
 
     def step(self, path: object) -> None:
-        """One operation on a path."""
+        """Count one operation on a path; raise if it must fail."""
         if str(path).startswith(self.folder):
             self.count += 1
             if self.count - 1 == self.fails_at:
@@ -45,7 +45,7 @@ class _FaultyDisk:
 
     @contextmanager
     def inserted(self) -> Iterator[None]:
-        """Files that are opened for writing, and renames, go through it."""
+        """Count files that are opened for writing, and renames, while the body runs."""
         opened, replaced = builtins.open, os.replace
 
         def open_(path: Any, mode: str = "r", *args: Any, **options: Any) -> Any:
@@ -64,7 +64,7 @@ class _FaultyDisk:
 
 
 class _FaultyFile:
-    """A file of which half of what is written arrives before the write fails."""
+    """A `_FaultyFile` is a file that receives half of the content before a write fails."""
 
     def __init__(self, file: IO[Any], path: object, disk: _FaultyDisk) -> None:
         self._file, self._path, self._disk = file, path, disk
@@ -88,7 +88,7 @@ class _FaultyFile:
 
 
 class _Taker(RunObserver):
-    """Does something to the output folder once the first frame has ended."""
+    """A `_Taker` changes the output folder after the first frame has ended."""
 
     def __init__(self, out: Path, take: Callable[[Path], None]) -> None:
         self.out, self.take, self.has_taken = out, take, False
@@ -114,7 +114,7 @@ TAKEN: dict[str, Callable[[Path], None]] = {
 
 
 def inject_faults(every: int, report: Callable[[str], None]) -> dict[str, Any]:
-    """Let every `every`-th operation fail by itself; how the runs ended, and those that ended as none should."""
+    """Let every `every`-th operation fail in turn; return numbers of outcomes and the findings."""
     with disturbed_runs(FRAMES, report) as runs:
         disk = _FaultyDisk(runs.out, None, 0)
         with disk.inserted():
@@ -132,7 +132,7 @@ def inject_faults(every: int, report: Callable[[str], None]) -> dict[str, Any]:
 
 
 def _judge(runs: DisturbedRuns, name: str, ended: str) -> None:
-    """Whether the run told of its trouble, left nothing that lies, and the next one repairs it."""
+    """Judge whether the run reported its trouble and left no false results, and whether the next run repairs it."""
     trouble = None
     if ended.startswith("foreign"):
         trouble = ended
@@ -142,7 +142,7 @@ def _judge(runs: DisturbedRuns, name: str, ended: str) -> None:
         read_log(runs.out)
         if list(runs.out.rglob("*.tmp")):
             trouble = "a temporary file stays"
-    # What stands in the place of a folder is for the user to remove.
+    # A file in the place of a folder is for the user to remove.
     for path in (runs.out, runs.out / "data"):
         if path.is_file():
             path.unlink()
@@ -150,7 +150,7 @@ def _judge(runs: DisturbedRuns, name: str, ended: str) -> None:
 
 
 def _ended(runs: DisturbedRuns, observer: RunObserver | None = None) -> str:
-    """How a run ended: "success", "told by its exit code", "told by an error", "foreign exception"."""
+    """The outcome of a run: "success", "told by its exit code", "told by an error", "foreign exception"."""
     try:
         return "told by its exit code" if runs.run(observer) else "success"
     except (DirectShapeError, OSError) as error:

@@ -1,4 +1,4 @@
-"""Runs that are ended at a random moment by a signal, or one of whose workers is; the next one goes on."""
+"""This module kills runs or their workers at a random moment by a signal, and resumes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SLOW_RUN = Path(__file__).parents[2] / "tests" / "helpers" / "slow_run.py"
 
 
 def kill_runs(count: int, seed: int, patience_s: float, report: Callable[[str], None]) -> dict[str, Any]:
-    """End `count` runs; how many of what, and those after which the next run did not end as an undisturbed one."""
+    """Kill `count` runs; return numbers by kind, and runs whose next run did not end like an undisturbed one."""
     with disturbed_runs(FRAMES, report) as runs:
         start = time.monotonic()
         assert _started(runs).wait(patience_s) == 0, "a run that nobody disturbs fails"
@@ -35,7 +35,7 @@ def kill_runs(count: int, seed: int, patience_s: float, report: Callable[[str], 
 
 
 def _ended_run(runs: DisturbedRuns, chance: random.Random, whole_s: float, patience_s: float) -> tuple[str, str | None]:
-    """Who was ended by what, and what went wrong."""
+    """Which process was killed by what, and what went wrong."""
     by, whom = chance.choice(SIGNALS), chance.choice(("parent", "parent", "worker"))
     run = _started(runs)
     try:
@@ -69,7 +69,7 @@ def _started(runs: DisturbedRuns) -> subprocess.Popen[bytes]:
 
 
 def _children(pid: int) -> list[int]:
-    """The workers of a run: those of its children that import the package."""
+    """The workers of a run, which are its children that import the package."""
     with suppress(FileNotFoundError):
         found = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
         return [int(each) for each in found if b"spawn_main" in Path(f"/proc/{each}/cmdline").read_bytes()]
@@ -77,7 +77,7 @@ def _children(pid: int) -> list[int]:
 
 
 def _outlive(workers: list[int], patience_s: float) -> bool:
-    """Whether some are there long after their parent has ended."""
+    """Whether some workers exist long after their parent has ended."""
     deadline = time.monotonic() + patience_s
     while any(Path(f"/proc/{each}").exists() for each in workers):
         if time.monotonic() > deadline:

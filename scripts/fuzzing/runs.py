@@ -1,4 +1,4 @@
-"""Disturbed runs: the next one must end with the bytes of one that nothing happened to."""
+"""This module disturbs runs; the next run must end with the bytes of an undisturbed run."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from directshape_torch.batch.refine_dataset import refine_dataset
 
 
 class DisturbedRuns:
-    """Counts disturbances of runs into the folder `out`, of the data set `root`, and what the next runs make of them.
+    """A `DisturbedRuns` counts disturbances of runs into the folder `out`, and the results of the next runs.
 
     Args:
-        folder: gets data set and outputs.
-        frames: of the data set.
-        report: is told of each disturbance.
+        folder: folder of data set and outputs.
+        frames: frames of the data set.
+        report: function that is told of each disturbance.
     """
 
     def __init__(self, folder: Path, frames: Sequence[str], report: Callable[[str], None]) -> None:
@@ -37,7 +37,7 @@ class DisturbedRuns:
         self.counts, self.found = Counter[str](), list[dict[str, str]]()
 
     def run(self, observer: RunObserver | None = None) -> int:
-        """Refine in this process; returns the exit code."""
+        """Refine in this process; return the exit code."""
         options = RefineOptions(threads=1)
         return refine_dataset(dataset(self.root), QuickRefiner(self.root), self.out, options, observer).exit_code
 
@@ -57,13 +57,13 @@ class DisturbedRuns:
 
     @property
     def figures(self) -> dict[str, Any]:
-        """Numbers of disturbances by kind, and what was found."""
+        """Numbers of disturbances by kind, and the findings."""
         number = {"runs that did not go on to the same bytes": len(self.found)}
         return {**dict(sorted(self.counts.items())), **number, "found": self.found}
 
 
 @contextmanager
 def disturbed_runs(frames: Sequence[str], report: Callable[[str], None]) -> Iterator[DisturbedRuns]:
-    """In a folder that goes afterwards."""
+    """Disturbed runs in a folder that is removed afterwards."""
     with tempfile.TemporaryDirectory(prefix="runs", ignore_cleanup_errors=True) as folder:
         yield DisturbedRuns(Path(folder), frames, report)

@@ -1,1 +1,1 @@
-"""Mutants of the hand-derived Jacobians: how they are made, which tests must catch them, how they are run."""
+"""This package makes mutants of the hand-derived Jacobians, names the tests that must catch them, and runs these."""

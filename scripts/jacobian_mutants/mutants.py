@@ -1,6 +1,6 @@
-"""Makes the mutants of a function from its syntax tree: every arithmetic node, component, axis and pair of terms.
+"""This module makes mutants of a function from its syntax tree: every arithmetic node, component, axis and term pair.
 
-Rules, all of them mechanical:
+All rules are mechanical:
 
 - sign flip: `a + b` becomes `a - b` and back; `-a` becomes `a`; an outermost arithmetic expression, an element of a
   list, an argument of a constructor and a value stored into a slice become their negative;
@@ -11,7 +11,7 @@ Rules, all of them mechanical:
   assignment of several names change places; a transposition is dropped, or put before a matrix product; the arguments
   of a cross product, of a batched matrix product, of an interpolation and of `where` change places.
 
-Arithmetic in shapes (arguments of `new_zeros`, `expand`, ...) is no arithmetic of a Jacobian and is left alone.
+Arithmetic in shapes (arguments of `new_zeros`, `expand`, ...) is not arithmetic of a Jacobian and is not changed.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from dataclasses import dataclass
 
 _SHAPE_MAKERS = {"new_zeros", "zeros", "expand", "reshape", "view", "view_as", "repeat", "eye", "arange", "range"}
 _ZERO_MAKERS = {"new_zeros", "zeros", "zeros_like"}
-# Which two arguments of a call change places.
+# These two arguments of a call are exchanged.
 _SWAPPED_ARGUMENTS = {"cross": (0, 1), "bmm": (0, 1), "lerp": (0, 1), "_along": (1, 2), "where": (1, 2)}
 _ARITHMETIC = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.MatMult, ast.Pow)
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """One change of one expression of one function."""
+    """A `Mutant` is one change of one expression of one function."""
 
-    path: str  # of the file, below the root of the tree
+    path: str  # path of the file, below the root of the tree
     function: str  # qualified name within the file
     line: int
     kind: str
@@ -41,7 +41,7 @@ class Mutant:
     end: int
 
     def apply(self, source: bytes) -> bytes:
-        """The file with this one change."""
+        """The content of the file with this change."""
         return source[: self.start] + self.after.encode() + source[self.end :]
 
     def __str__(self) -> str:
@@ -52,7 +52,7 @@ def mutants_of(path: str, source: bytes, functions: tuple[str, ...]) -> list[Mut
     """All mutants of the named functions of a file, in the order of the file.
 
     Raises:
-        KeyError: the file has no function of that name.
+        KeyError: the file has no function with this name.
     """
     offsets = _line_offsets(source)
     definitions = dict(_functions(ast.parse(source)))
@@ -89,7 +89,7 @@ def _negative(node: ast.expr) -> ast.expr:
 
 
 def _is_tensor_like(node: ast.expr) -> bool:
-    """Something that may hold numbers other than zero, and that no other rule flips."""
+    """Whether an expression may hold numbers other than zero, and no other rule flips it."""
     if isinstance(node, ast.Call):
         return _called_name(node) not in _ZERO_MAKERS
     return isinstance(node, ast.Name | ast.Attribute | ast.Subscript)
@@ -105,7 +105,7 @@ Change = tuple[ast.expr, str, str]
 
 
 class _Changes:
-    """Walks a function and yields (expression, kind of change, new text)."""
+    """A `_Changes` walks a function and yields (expression, kind of change, new text)."""
 
     def of(self, function: ast.FunctionDef) -> Iterator[Change]:
         for statement in function.body:
@@ -135,7 +135,7 @@ class _Changes:
 
 
 def _children(node: ast.AST) -> Iterator[ast.AST]:
-    """Where to look further: not into shapes, indices, annotations."""
+    """Child nodes without shapes, indices and annotations."""
     if isinstance(node, ast.Subscript):
         yield node.value
     elif isinstance(node, ast.Call) and _called_name(node) in _SHAPE_MAKERS:
@@ -232,7 +232,7 @@ def _component_changes(node: ast.Subscript) -> Iterator[Change]:
 
 
 def _other_component(part: ast.expr) -> ast.expr | None:
-    """A neighbouring component: 2 for 1, 1 for 0; the neighbouring block of a slice with constant ends."""
+    """A neighbouring component: 2 for 1, 1 for 0, or the neighbouring block of a slice with constant ends."""
     if isinstance(part, ast.Constant) and isinstance(part.value, int) and not isinstance(part.value, bool):
         return ast.Constant(part.value - 1 if part.value > 0 else 1)
     if not isinstance(part, ast.Slice) or part.step is not None:
@@ -251,5 +251,5 @@ def _constant(node: ast.expr | None) -> int | None:
 
 
 def _text(node: ast.expr) -> str:
-    """Source of an expression that may stand anywhere in another one."""
+    """Source of an expression that may be placed anywhere in another one."""
     return f"({ast.unparse(node)})"

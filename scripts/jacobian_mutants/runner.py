@@ -1,7 +1,7 @@
-"""Runs mutants: pytest runs the named tests once as they are, then a process is forked for each mutant.
+"""This module runs mutants: pytest runs the named tests once unchanged, then a process is forked for each mutant.
 
-In the fork the mutated function gets its changed code object, so that every module that imported it sees the mutant,
-and the tests run until the first fails. Nothing is written: neither the checkout nor a copy of it is edited.
+In the fork the mutated function gets its changed code object, so that every module that imported it uses the mutant,
+and the tests run until the first failure. Nothing is written: neither the checkout nor a copy of it is edited.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ import pytest
 from jacobian_mutants.mutants import Mutant
 
 Verdict = Literal["caught", "survived", "timed out", "no verdict"]
-# How many mutants share one collection of tests.
+# This number of mutants shares one collection of tests.
 _CHUNK = 40
-# What every test file needs and no mutant changes; `torch.testing` imports the distributed tensors at first use.
+# Every test file needs these and no mutant changes them; `torch.testing` imports the distributed tensors on first use.
 _PRELOADED = ("pytest", "torch", "torch.distributed.tensor", "torch.autograd.gradcheck", "hypothesis.strategies")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the named tests said of a mutant."""
+    """An `Outcome` is the result of the named tests for a mutant."""
 
     mutant: Mutant
     target: str
     verdict: Verdict
     caught_by: str  # path::test, or empty
-    error: str  # first line of what the test reported: a wrong number, or a crash
+    error: str  # first line of the test's report: a wrong number, or a crash
 
 
 class Job(NamedTuple):
-    """Mutants of one file that the same tests must catch; what a collecting process gets."""
+    """A `Job` has mutants of one file that the same tests must catch, for one collecting process."""
 
     root: Path
     target: str
@@ -56,7 +56,7 @@ class Job(NamedTuple):
 
 
 class UnmutatedFailureError(Exception):
-    """The tests named for a target fail, or could not be run, without any mutation."""
+    """The tests named for a target fail, or could not run, without any mutation."""
 
 
 def run_mutants(
@@ -66,14 +66,14 @@ def run_mutants(
     processes: int,
     finished: Callable[[Outcome], None],
 ) -> list[Outcome]:
-    """Outcomes in the order of `mutants` (target, mutant); also checks that the tests pass unmutated.
+    """Outcomes in the order of `mutants` (target, mutant), after a check that the tests pass without mutation.
 
     Args:
-        root: the tree that holds the sources and `tests`.
+        root: tree of the sources and `tests`.
         mutants: targets and their mutants.
         tests_of: the tests named for a target.
-        processes: how many mutants run at once.
-        finished: told of each outcome.
+        processes: number of mutants that run at once.
+        finished: function that is told of each outcome.
 
     Raises:
         UnmutatedFailureError: the tests of a target fail without a mutation.
@@ -84,12 +84,12 @@ def run_mutants(
         source = (root / own[0].path).read_bytes()
         chunks = (tuple(own[i : i + _CHUNK]) for i in range(0, len(own), _CHUNK))
         jobs += [Job(root, target, tests_of[target], source, chunk) for chunk in chunks]
-    # Before the server of processes starts: its children inherit it.
+    # The variable is set before the server of processes starts, because its children inherit it.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(list(_PRELOADED))
     outcomes: list[Outcome] = []
-    # A process for each job, for modules stay imported.
+    # Each job has its own process, because modules stay imported.
     with ProcessPoolExecutor(processes, mp_context=context, max_tasks_per_child=1) as pool:
         try:
             for part in pool.map(_collect_and_fork, jobs):
@@ -103,7 +103,7 @@ def run_mutants(
 
 
 def _collect_and_fork(job: Job) -> list[Outcome]:
-    """In a process of its own: runs the tests without a mutation, then once for each mutant."""
+    """In a separate process, run the tests without a mutation, then once for each mutant."""
     os.chdir(job.root)
     plugin = ForkedTests(job)
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
@@ -115,18 +115,18 @@ def _collect_and_fork(job: Job) -> list[Outcome]:
     return plugin.outcomes
 
 
-# A mutant may loop for ever; the slowest named tests take seconds, on a busy machine a minute.
+# A mutant may loop for ever. The slowest named tests take seconds, on a busy machine a minute.
 TIMEOUT_S = 240.0
 
 
 class ForkedTests:
-    """A plugin of pytest: the outcomes of a job's mutants, or the trouble that there is without a mutation."""
+    """A `ForkedTests` is a pytest plugin with the outcomes of a job's mutants, or the trouble without a mutation."""
 
     def __init__(self, job: Job) -> None:
         self._job, self.outcomes = job, list[Outcome]()
         self._failed = self._error = ""
         self.trouble = "pytest ended before it had collected the tests"
-        # The tree must win over an installed package.
+        # The tree must take precedence over an installed package.
         sys.path.insert(0, str(job.root))
 
     def pytest_collectreport(self, report: Any) -> None:
@@ -140,11 +140,11 @@ class ForkedTests:
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         if session.testsfailed or not session.items:
             return True
-        # Once without a mutation: it must pass, and leaves imports and rendered scenes in memory for the forks.
+        # The run without a mutation must pass; it also leaves imports and rendered scenes in memory for the forks.
         verdict, test, error = self._run(session)
         self.trouble = "" if verdict == "survived" else f"{test} without a mutation: {error}"
         if not self.trouble:
-            # A fork need not look for garbage in what is loaded by now, nor copy it by doing so.
+            # Forks then do not collect garbage in existing objects, which would copy their memory.
             gc.freeze()
             for mutant in self._job.mutants:
                 self.outcomes.append(Outcome(mutant, self._job.target, *self._verdict(session, mutant)))
@@ -190,7 +190,7 @@ def put_into_effect(mutant: Mutant, source: bytes, root: Path) -> None:
 
     Raises:
         ValueError: the module was imported from another tree, or its file has changed since `source` was read.
-        LookupError: it has no such function.
+        LookupError: the module has no such function.
     """
     module = importlib.import_module(mutant.path.removesuffix(".py").replace("/", "."))
     file = str(module.__file__)
@@ -233,7 +233,7 @@ def _code_of(source: bytes, file: str, qualified_name: str) -> CodeType:
                     return deeper
         return None
 
-    # A mutant such as `(1)[:, None]` is warned of; that it fails is for the tests to say.
+    # A mutant such as `(1)[:, None]` raises a warning; the tests decide whether it fails.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SyntaxWarning)
         found = search(compile(source, file, "exec"))

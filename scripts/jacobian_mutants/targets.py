@@ -1,4 +1,4 @@
-"""Which functions hold hand-derived derivatives, which tests must catch a mistake in them, which ones no test can."""
+"""This module lists functions with hand-derived derivatives, tests that must catch mistakes, and equivalents."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jacobian_mutants.mutants import Mutant
 
 @dataclass(frozen=True)
 class Target:
-    """Functions of one file (`Class.method` for methods) and the tests named for them, the quickest first."""
+    """A `Target` has functions of one file (`Class.method` for methods) and their tests, the fastest first."""
 
     path: str
     functions: tuple[str, ...]
@@ -216,7 +216,7 @@ TARGETS: dict[str, Target] = {
 
 @dataclass(frozen=True)
 class Equivalent:
-    """Mutants of a function that compute the same: those of this text, to `after` or, where None, to anything."""
+    """An `Equivalent` is mutants of a function with an equal result: of this text, to `after` or, if None, to any."""
 
     function: str
     before: str
@@ -288,5 +288,5 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
 
 
 def reason_for(mutant: Mutant) -> str | None:
-    """Why a mutant is excluded; None where it is not."""
+    """The reason why a mutant is excluded, or None if it is not."""
     return next((e.reason for e in EQUIVALENTS if e.matches(mutant)), None)

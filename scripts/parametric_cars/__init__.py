@@ -1,1 +1,1 @@
-"""Parametric passenger cars, which the bundled priors and the demo scene are made of: no foreign mesh goes in."""
+"""This package makes the parametric passenger cars of the bundled priors and the demo scene, without meshes."""

@@ -1,4 +1,4 @@
-"""What a parametric passenger car is: its measures, and how they vary within each body type."""
+"""This module has the measures of a parametric passenger car and their variation in each body type."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from directshape_torch.errors import InputError
 
 @dataclass(frozen=True)
 class CarParameters:
-    """Measures of one car. Lengths in metres; `*_u` are distances behind the front end, `*_height` above the ground."""
+    """A `CarParameters` has measures of one car; `*_u` are distances behind the front, `*_height` above ground."""
 
     body_type: str  # one of `BODY_TYPES`
-    length: float  # outer measures, without mirrors
+    length: float  # outer measures in metres, without mirrors
     width: float
     height: float
     ground_clearance: float  # of the underbody between the axles
@@ -27,40 +27,40 @@ class CarParameters:
     wheel_radius: float  # of the tyres
     wheel_width: float
     nose_height: float  # of the bonnet's leading edge
-    nose_setback: float  # by which that edge lies behind the bumper
+    nose_setback: float  # distance of that edge behind the bumper
     bonnet_bulge: float  # height of the bonnet's arc over its chord
     cowl_u: float  # foot of the windscreen
     cowl_height: float
     roof_front_u: float  # top of the windscreen
-    roof_front_drop: float  # by which it lies below the roof's highest point
+    roof_front_drop: float  # distance below the roof's highest point
     roof_peak_u: float  # highest point of the roof
     roof_rear_u: float  # rear end of the roof
-    roof_rear_drop: float  # by which it lies below the highest point
+    roof_rear_drop: float  # distance below the highest point
     rear_glass_base_u: float  # foot of the rear window
     rear_glass_base_height: float
     tail_height: float  # upper rear edge of the boot or tailgate
-    tail_setback: float  # by which it lies before the rear end
+    tail_setback: float  # distance from the rear end
     belt_height: float  # lower edge of the side windows
     tumblehome: float  # inward lean of the side windows, metres per metre of height
-    sill_tuck: float  # by which the body sides draw in from the belt to the sill
+    sill_tuck: float  # inward shift of the body sides from the belt to the sill
     taper_front: float  # share of the half width that the plan view loses towards the ends
     taper_rear: float
-    bow_front: float  # by which the corners lie behind the middle of the bumper, plan view
+    bow_front: float  # distance of the corners behind the middle of the bumper, plan view
     bow_rear: float
-    roof_crown: float  # by which roof and bonnet fall from the middle towards the sides
+    roof_crown: float  # fall of roof and bonnet from the middle towards the sides
     edge_radius: float  # of the edges between the sides and roof, bonnet and ends
 
 
-# Columns of the table below, mean and standard deviation each but `share` and `clearance`. Positions are shares of the
-# length, heights (but the drop, in metres) are shares of the height.
+# Columns of the table have mean and standard deviation, except `share` and `clearance`. Positions are shares of the
+# length; heights are shares of the height, except that the drop is in metres.
 _COLUMNS = (
     "share", "length", "width", "height", "clearance", "front_axle", "wheelbase", "wheel_radius", "nose_height", "cowl",
     "cowl_height", "roof_front", "roof_rear", "roof_rear_drop", "rear_glass_base", "rear_glass_base_height",
     "tail_height", "tumblehome",
 )  # fmt: skip
-# Typical measures of passenger cars of each class, adjusted by hand to how the resulting prior fits real cars; no
-# single model. The shares make the mixture's length, width and height those of KITTI's labelled cars (3.88, 1.63,
-# 1.53 m).
+# These are typical measures of each class of passenger cars, not of single models, adjusted by hand to how the
+# resulting prior fits real cars. The shares give the mixture the length, width and height of KITTI's labelled cars
+# (3.88, 1.63, 1.53 m).
 _STATISTICS: Mapping[str, tuple[Any, ...]] = {
     "city": (
         0.16, (3.28, 0.14), (1.49, 0.09), (1.47, 0.05), 0.19,
@@ -116,14 +116,14 @@ BODY_TYPES: tuple[str, ...] = tuple(_STATISTICS)
 
 
 def sample_car(seed: int | np.random.Generator, body_type: str | None = None) -> CarParameters:
-    """Draw a car; the same seed gives the same car.
+    """Draw a car; equal seeds give equal cars.
 
     Args:
         seed: integer, or a numpy generator to draw from.
         body_type: one of `BODY_TYPES`; None draws one by its share of the traffic.
 
     Raises:
-        InputError: unknown body type.
+        InputError: the body type is unknown.
     """
     rng = np.random.default_rng(seed)
     if body_type is None:
@@ -137,7 +137,7 @@ def sample_car(seed: int | np.random.Generator, body_type: str | None = None) ->
 def _draw(rng: np.random.Generator, body_type: str, statistics: Mapping[str, Any]) -> CarParameters:
     def draw(name: str) -> float:
         mean, deviation = statistics[name]
-        # Cut at two deviations: a rare extreme car would spoil the principal components.
+        # Values are cut at two deviations, because a rare extreme car would distort the principal components.
         return float(mean + deviation * np.clip(rng.standard_normal(), -2.0, 2.0))
 
     def uniform(low: float, high: float) -> float:

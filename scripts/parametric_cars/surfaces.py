@@ -1,4 +1,4 @@
-"""Parametric passenger cars: measures drawn at random, their solid, signed distance, closed mesh and named parts."""
+"""This module makes the solid, signed distance, closed mesh and named parts of a parametric car."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _SURFACE_SPACING_M = 0.04
 _TABLE_SPACING_M = 0.02
 _TABLE_MARGIN_M = 0.6
 _ARCH_GAP_M = 0.04
-# A groove around the tyre, no cavity behind the wheel: meshes of real cars have liners there.
+# The arch is a groove around the tyre without a cavity behind the wheel, where meshes of real cars have liners.
 _ARCH_DEPTH_M = 0.08
 
 
 @dataclass(frozen=True)
 class _SideView:
-    """Signed distance to the side view's outline, tabulated; x forward from the car's middle, height upwards."""
+    """A `_SideView` is the tabulated signed distance to the side view's outline; x is forward from the car's middle."""
 
     distance: Array  # (nx, nh)
     origin: tuple[float, float]
@@ -50,7 +50,8 @@ def side_outline(car: CarParameters) -> Array:
     front_face = car.nose_height - car.bumper_clearance_front
     rear_face = car.tail_height - car.bumper_clearance_rear
     rear_axle_u = car.front_axle_u + car.wheelbase
-    # Distance behind the front end, height above the ground, and how far from the corner its rounding begins.
+    # Columns are distance behind the front, height above the ground, and distance from the corner where rounding
+    # begins.
     corners = np.array(
         [
             (0.06, car.bumper_clearance_front, 0.12),
@@ -77,7 +78,7 @@ def side_outline(car: CarParameters) -> Array:
 
 
 def _round_corners(polygon: Array, reach_m: Array) -> Array:
-    """Replaces each corner of a closed polygon by a parabola that begins at most `reach_m` before and after it."""
+    """Replace each corner of a closed polygon by a parabola that begins at most `reach_m` before and after it."""
     t = np.linspace(0.0, 1.0, 6)[:, None]
     arcs = []
     neighbours = zip(np.roll(polygon, 1, axis=0), polygon, np.roll(polygon, -1, axis=0), reach_m, strict=True)
@@ -127,7 +128,7 @@ def half_width(car: CarParameters, x: Array, height: Array) -> Array:
 
 
 def axle_x(car: CarParameters) -> tuple[float, float]:
-    """Front and rear axle, forward of the car's middle."""
+    """Positions of front and rear axle, forward of the car's middle."""
     front = 0.5 * car.length - car.front_axle_u
     return front, front - car.wheelbase
 
@@ -170,14 +171,14 @@ def _arches_and_wheels(car: CarParameters, x: Array, height: Array, side: Array)
 
 
 def car_mesh(parameters: CarParameters, spacing_m: float = 0.03) -> trimesh.Trimesh:
-    """Closed triangle mesh of a car in the object frame, normals outward.
+    """Closed triangle mesh of a car in the object frame, with outward normals.
 
     Args:
         parameters: the measures, from `sample_car`.
-        spacing_m: sampling of the solid; edges are about as long.
+        spacing_m: sampling of the solid; edges have about this length.
 
     Raises:
-        InputError: spacing not within 5 mm to 0.2 m.
+        InputError: the spacing is not within 5 mm to 0.2 m.
     """
     import trimesh
 
@@ -190,8 +191,8 @@ def car_mesh(parameters: CarParameters, spacing_m: float = 0.03) -> trimesh.Trim
 def car_sdf(parameters: CarParameters, points_obj: Array) -> Array:
     """Signed distance (N,) of points (N, 3) to a car's surface, metres, negative inside.
 
-    Distances are to the tangent plane of the nearest of densely sampled surface points when they are near, so that
-    they are right to a few millimetres; the solid's implicit function is no distance where its parts are bent.
+    Near the surface, distances are to the tangent plane of the nearest of densely sampled surface points, which is
+    accurate to a few millimetres. The solid's implicit function is not a distance where its parts are bent.
     """
     points = np.asarray(points_obj, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -221,7 +222,7 @@ def _half_symmetric_surface(car: CarParameters, spacing_m: float) -> tuple[Array
     margin = 3 * spacing_m
     x = np.arange(-0.5 * car.length - margin, 0.5 * car.length + margin + spacing_m, spacing_m)
     y = np.arange(-car.height - margin, margin + spacing_m, spacing_m)
-    # A node plane off the middle (half a step) keeps the mirrored halves from sharing degenerate triangles.
+    # No node plane is in the middle (half a step off), so that the mirrored halves share no degenerate triangles.
     z_half = (np.arange(int((0.5 * car.width + margin) / spacing_m) + 2) + 0.5) * spacing_m
     nodes = np.stack(np.meshgrid(x, y, z_half, indexing="ij"), axis=-1).reshape(-1, 3)
     half = implicit(car, nodes).reshape(len(x), len(y), len(z_half))

@@ -1,1 +1,1 @@
-"""Parts of `scripts/calibrate_trust.py`."""
+"""This package has parts of `scripts/calibrate_trust.py`."""

@@ -32,30 +32,30 @@ from directshape_torch.state.cars import CarBatch
 
 Array = NDArray[np.float64]
 EVERYTHING = AcceptanceConfig(min_probability_better=0.0, min_probability_not_worse=0.0)
-# Neighbours in a drive show the same cars.
+# Neighbouring frames in a drive show the same cars, so boxes are placed on frames this far on.
 _FRAMES_ON, _MOST_OVERLAP = (5, 7, 11), 0.3
 
 
 class Frame(NamedTuple):
-    """Cars of a frame that were refined, by the images alone."""
+    """A `Frame` has the cars of a frame that were refined by the images only."""
 
     result: RefinementResult
     detections: Detections
-    cars: CarBatch  # of them
-    boxes: tuple[Tensor, Tensor] | None  # (N, 7) of detections and labels in the frame of labels; None: no cars there
-    before: Array  # (N,) overlap of the input with the label; NaN without a label
-    images: Array  # (N,) overlap of the images' box with the label
+    cars: CarBatch  # of the cars
+    boxes: tuple[Tensor, Tensor] | None  # (N, 7) of detections and labels in the frame of labels; None without cars
+    before: Array  # (N,) IoU of the input with the label; NaN without a label
+    images: Array  # (N,) IoU of the images' box with the label
 
 
 class Judged(NamedTuple):
-    """N cars of a run as some image noise and some detector's standard deviations have them."""
+    """A `Judged` has N cars of a run for a given image noise and a detector's standard deviations."""
 
-    before: Array  # (N,) overlap of the input with the label; NaN without a label
-    images: Array  # (N,) overlap of the images' box with the label
-    after: Array  # (N,) overlap of the most probable box with the label
+    before: Array  # (N,) IoU of the input with the label; NaN without a label
+    images: Array  # (N,) IoU of the images' box with the label
+    after: Array  # (N,) IoU of the most probable box with the label
     evidence: Array  # (N, E)
-    chance: Array  # (N, 2) of a better and of a not worse box, where the car is there
-    standard: Array  # (N, 7) errors of the most probable box over their standard deviations
+    chance: Array  # (N, 2) probabilities of a better and of a not worse box if the car is there
+    standard: Array  # (N, 7) errors of the most probable box in standard deviations
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Cars:
         return Judged(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def overlaps(self) -> tuple[Array, Array]:
-        """Overlaps (N,) of inputs and of the images' boxes with the labels."""
+        """IoU (N,) of inputs and of the images' boxes with the labels."""
         return np.concatenate([frame.before for frame in self.frames]), np.concatenate([f.images for f in self.frames])
 
 
@@ -123,7 +123,7 @@ def _poses(boxes: Tensor, t_cam_ref: Tensor) -> Tensor:
 
 
 def errors_of_images(frame: Frame) -> tuple[Array, Array]:
-    """What labels say that the images' boxes are off by (N, 7), and their uncalibrated standard deviations."""
+    """Errors (N, 7) of the images' boxes against labels, and their uncalibrated standard deviations."""
     assert frame.boxes is not None
     truth, like = frame.boxes[1], frame.result.T_cam_obj
     of_truth = replace(
@@ -144,11 +144,11 @@ def refined_cars(
     with_wrong: bool,
     by_frame: bool,
 ) -> Cars:
-    """All cars of a run, whose rigs are estimated from its detections, every result returned."""
+    """All cars of a run whose rigs are estimated from its detections, with every result returned."""
     torch.set_num_threads(1)
     dataset = open_dataset("kitti", root, detections, masks)
     config = load_config(None, overrides)
-    # What the images say alone, which is brought together with the detections as this script sees it.
+    # Results are those of the images alone, and are combined with the detections by this script.
     alone = replace(config.priors, detector_weight=0.0)
     config = replace(config, acceptance=EVERYTHING, check="off", priors=alone)
     refiner = DirectShapeRefiner(config=config, rig=None if by_frame else RigEstimates(estimate_rigs(dataset)))
@@ -176,7 +176,7 @@ def _with_labels(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> list[Frame
 
 
 def _elsewhere(refiner: DirectShapeRefiner, loaded: Sequence[LoadedFrame]) -> list[Frame]:
-    """Boxes and masks on the images of other frames, where these have no labelled object like them."""
+    """Boxes and masks on the images of other frames that have no labelled object like them."""
     frames = []
     pairs = [(each, loaded[(n + on) % len(loaded)]) for on in _FRAMES_ON for n, each in enumerate(loaded)]
     for each, other in pairs:
@@ -215,7 +215,7 @@ def _swapped(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> list[Frame]:
 
 
 def _corrected(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> FrameBatch:
-    """The frame with what is known of its rig, as the refiner sees it."""
+    """The frame with the known parts of its rig, as the refiner uses it."""
     assert refiner.rig is not None
     return refiner.rig.corrected(loaded.frame)
 
@@ -238,16 +238,16 @@ def _frame(
 
 
 def probabilities(judged: Judged, is_there: LogisticHead) -> Array:
-    """Probabilities (N, 2) of better and not worse boxes, the chance that the car is there included."""
+    """Probabilities (N, 2) of better and not worse boxes, including the probability that the car is there."""
     return np.asarray(is_there(torch.from_numpy(judged.evidence)).numpy()[:, None] * judged.chance)
 
 
 def returned(judged: Judged, is_there: LogisticHead, limits: AcceptanceConfig) -> NDArray[np.bool_]:
-    """Which boxes (N,) come back."""
+    """Whether boxes (N,) are returned."""
     least = limits.min_probability_better, limits.min_probability_not_worse
     return np.asarray((probabilities(judged, is_there) >= least).all(axis=1))
 
 
 def outcomes(judged: Judged) -> NDArray[np.bool_]:
-    """(N, 2) whether the most probable box is better than the input, and whether it is not worse."""
+    """Whether (N, 2) the most probable box is better than the input, and whether it is not worse."""
     return np.stack([judged.after > judged.before, judged.after >= judged.before - WORSE_BY], axis=1)

@@ -1,4 +1,4 @@
-"""Result files of simulated detectors: labels with the errors of one, drawn anew for each seed."""
+"""This module writes result files of simulated detectors: labels with random errors for each seed."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ _LEAST_HEIGHT_PX = 25.0
 
 
 class DetectorNoise(NamedTuple):
-    """Standard deviations of a detector's errors."""
+    """A `DetectorNoise` has standard deviations of a detector's errors."""
 
-    depth_share: float  # of the place along the viewing ray, as a share of it
+    depth_share: float  # of the position along the viewing ray, as a share of the distance
     side_m: float
     height_m: float
     yaw_deg: float
-    flipped: float  # share of boxes that are turned round
+    flipped: float  # share of boxes that are rotated by 180 degrees
 
 
 SIMULATED: Mapping[str, DetectorNoise] = {
     "stereo": DetectorNoise(0.025, 0.12, 0.05, 5.0, 0.0),
     "mono": DetectorNoise(0.05, 0.25, 0.10, 9.0, 0.05),
 }
-"""Detectors as of a stereo pair and of one camera, both with cars of the mean size."""
+"""These are detectors as of a stereo pair and of one camera, both with cars of the mean size."""
 
 
 def write_draws(dataset: StereoDataset, name: str, folders: Sequence[Path]) -> None:
-    """Write what the detector of that name says of the labelled cars at least 25 px high, one draw a folder."""
+    """Write the results of the named detector for labelled cars at least 25 px high, one draw in each folder."""
     noise = SIMULATED[name]
     for number, frame_id in enumerate(dataset.frame_ids):
         loaded = dataset.load(frame_id)

@@ -1,4 +1,4 @@
-"""What the images are off by, and the regression that says whether a car is there; numpy alone."""
+"""This module fits the errors of the images and the regression that says whether a car is there, with numpy only."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from trust_calibration.cars import Array, Cars, errors_of_images
 
 FACTORS, FLOORS = np.r_[0.0, np.geomspace(0.1, 4, 25)], np.geomspace(0.005, 0.5, 40)
 _RIDGE = 3.0
-# One mask in twenty is of nothing that its box says.
+# One mask in twenty does not show what its box says.
 _NOT_THERE = 0.05
-# The images' box of a car that is there overlaps its label by that much, or as much as the input.
+# If the car is there, the images' box has this IoU with its label, or as much as the input.
 _LEAST_IOU = 0.5
 
 
 def fit_noise(runs: Sequence[Cars]) -> ImageNoise:
-    """Factors and floors of the highest likelihood; every root counts as much as another."""
+    """Factors and floors of the highest likelihood, with equal weight for every root."""
     rows, weights = [], []
     for root in {run.root for run in runs}:
         frames = [frame for run in runs if run.root == root for frame in run.frames]
@@ -54,13 +54,13 @@ def fit_head(there: Array, not_there: Array) -> LogisticHead:
     X, y = np.concatenate([there, not_there]), np.r_[np.ones(len(there)), np.zeros(len(not_there))]
     means, scales = np.nanmean(X, axis=0), np.nanstd(X, axis=0)
     weights, bias = logistic(np.nan_to_num(np.clip((X - means) / scales, -3, 3)), y)
-    # The sample has other shares of both than the world.
+    # The shares of the two classes differ between the sample and real data.
     bias += float(np.log((1 - _NOT_THERE) / _NOT_THERE) - np.log(len(there) / len(not_there)))
     return LogisticHead(tuple(means.tolist()), tuple(scales.tolist()), tuple(weights.tolist()), bias)
 
 
 def logistic(Z: Array, y: NDArray[np.float64]) -> tuple[Array, float]:
-    """Newton's method on the penalised likelihood; the ridge holds the weights, not the bias."""
+    """Minimise the penalised likelihood by Newton's method; the ridge penalises the weights, not the bias."""
     A = np.column_stack([Z, np.ones(len(Z))])
     penalty = np.append(np.full(Z.shape[1], _RIDGE), 1e-6)
     theta = np.zeros(A.shape[1])
