@@ -1,4 +1,4 @@
-"""Lets tests import `helpers`, and keeps random numbers the same from run to run."""
+"""This file lets tests import `helpers`, and keeps random numbers the same in every run."""
 
 from __future__ import annotations
 
@@ -25,5 +25,5 @@ def _seed() -> None:
 
 @pytest.fixture(autouse=True)
 def _fresh_count_of_cars(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The setting `compile: auto` counts the cars of a process: without this a test would change form in the middle."""
+    """Reset the count of cars of the process, by which `compile: auto` would change the form within a test."""
     monkeypatch.setattr(compile_module, "_process", compile_module._Process())

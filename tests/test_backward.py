@@ -1,4 +1,4 @@
-"""Gradients through the refiner: each differentiable input against differences, the modes against each other."""
+"""Gradients through the refiner agree with differences for each input, and the modes with each other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which calls are compiled and how often, which take the plain form, and what happens where compiling fails."""
+"""These tests check which calls are compiled and how often, which run plainly, and what happens on failure."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ class TestPlain:
 
 @pytest.mark.usefixtures("_traced")
 class TestAuto:
-    """One rule: a job of so many cars."""
+    """A `TestAuto` has the tests of the rule for jobs of many cars."""
 
     def test_where_nobody_has_told_of_a_job_nothing_is_compiled(self, nearest: Nearest) -> None:
         for _ in range(3):
@@ -266,7 +266,7 @@ def test_what_keeps_the_compiler_from_working_is_said(name: str, reason: str, tm
 class TestFailure:
     @staticmethod
     def branching(x: Tensor) -> Tensor:
-        """One that cannot be one graph."""
+        """A function that cannot be one graph."""
         return x + 1 if bool(x.sum() > 0) else x - 1
 
     @pytest.fixture

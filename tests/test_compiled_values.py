@@ -1,7 +1,7 @@
-"""Every compiled function against its plain form, on all that a refinement asks of it.
+"""Every compiled function agrees with its plain form, on all calls of a refinement.
 
-What the compiler does with memory depends on the whole of a function and on the sizes it is given, so nothing smaller
-than the real functions with real arguments tells whether their code is right.
+The compiler's use of memory depends on the whole function and on its sizes, so only real functions with real arguments
+show whether their code is right.
 """
 
 from __future__ import annotations
@@ -93,13 +93,13 @@ def differences(name: str, found: object, expected: object) -> Iterator[str]:
 
 
 def by_component(output: Tensor, axes: tuple[int, ...]) -> Tensor:
-    """(components, elements of each) in double precision."""
+    """Values (components, elements of each) in double precision."""
     count = torch.Size([output.shape[axis] for axis in axes]).numel()
     return output.movedim(axes, tuple(range(len(axes)))).reshape(count, -1).double()
 
 
 def share_that_differs(found: Tensor, expected: Tensor) -> Tensor:
-    """Of the elements of each component; what is not finite has to be the same."""
+    """Share of differing elements in each component; values that are not finite must be the same."""
     finite = expected.isfinite()
     size = torch.where(finite, expected, 0.0).abs().sum(dim=1) / finite.sum(dim=1).clamp_min(1)
     near = (found - expected).abs() <= TOLERANCE * (size[:, None] + expected.abs()) + FLOOR

@@ -1,4 +1,4 @@
-"""Settings: unknown keys name the nearest one, wrong kinds and values out of range name the key."""
+"""In settings, unknown keys name the nearest one, and wrong kinds and values out of range name the key."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Surfaces that are tracked from state to state: found again where they are, and lost where there are none."""
+"""Surfaces that are tracked between states are found where they are, and lost where there are none."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ OWNER = torch.zeros(1, dtype=torch.long)
 
 
 def _pose(shift: tuple[float, float, float]) -> torch.Tensor:
-    """The camera 10 m in front of the sphere, the sphere shifted by metres."""
+    """A camera 10 m in front of the sphere, which is shifted by metres."""
     T_obj_cam = torch.eye(4, dtype=torch.float64)[None].clone()
     T_obj_cam[0, :3, 3] = torch.tensor([0.0, 0.0, -10.0], dtype=torch.float64) - torch.tensor(shift)
     return T_obj_cam
@@ -30,7 +30,7 @@ def _rays() -> Rays:
 
 
 def _depth_of(rays: Rays, T_obj_cam: torch.Tensor) -> torch.Tensor:
-    """Of the first point of the sphere, by the quadratic equation."""
+    """Depth of the first point of the sphere, by the quadratic equation."""
     x = rays.in_objects(T_obj_cam)
     a, b = (x.direction_obj**2).sum(0), (x.centre_obj * x.direction_obj).sum(0)
     return (-b - (b**2 - a * ((x.centre_obj**2).sum(0) - RADIUS_M**2)).sqrt()) / a

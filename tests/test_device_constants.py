@@ -1,4 +1,4 @@
-"""Constants: right in every mode, whichever of them asked first."""
+"""Constants are right in every mode, whichever mode asked first."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from directshape_torch.numerics.tensors import constant_like, made_once
 
 
 class Constants:
-    """Two that nobody has asked for before."""
+    """A `Constants` has two constants that were not requested before."""
 
     def __init__(self, first: float) -> None:
         self.first = first

@@ -1,4 +1,4 @@
-"""Terms that a user brings count like ours; mistakes in them are named, and what is no number stays in its car."""
+"""Terms of a user count like the package's; mistakes in them are named, and NaN stays in its car."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from directshape_torch.terms.term import Linear, Sight, Term, Where
 
 
 def lower_by(metres: Tensor | float) -> Callable[[CarBatch, CarState], PriorResidual]:
-    """The height above the ground, as if the ground were lower by so much."""
+    """The height prior for a ground that is lower by the given distance."""
 
     def residual(cars: CarBatch, state: CarState) -> PriorResidual:
         at = height_prior(cars, state)
@@ -57,7 +57,7 @@ def refine(
 
 @cache
 def healthy() -> RefinementResult:
-    """With the term on the ground itself; nobody changes it."""
+    """The result with the term on the ground itself, which must not be changed."""
     return refine(made(residual_of=lower_by(0.0)))
 
 
@@ -118,7 +118,7 @@ def _with(**members: Any) -> type[PriorTerm]:
 
 
 def _own(name: str) -> Callable[[PriorTerm], Any]:
-    """A property as the intact term has it."""
+    """A property of the intact term."""
     return getattr(PriorTerm, name).fget  # type: ignore[no-any-return]
 
 
@@ -238,7 +238,7 @@ def test_what_a_subclass_leaves_out_is_named_unless_it_has_a_default(name: str) 
 
 @dataclass(frozen=True)
 class LowerTerm(Term):
-    """Heights as above, of numbers that are fields."""
+    """A `LowerTerm` has heights over a lower ground, with numbers that are fields."""
 
     names: tuple[str, ...]
     cars: CarBatch
@@ -297,13 +297,13 @@ def test_a_residual_without_a_jacobian_is_differentiated() -> None:
 
 
 class ResidualTerm(LowerTerm):
-    """The residual alone."""
+    """A `ResidualTerm` has only the residual."""
 
     linear = Term.linear
 
 
 class TwoToARow(ResidualTerm):
-    """Two residuals in each row, which have one inner scalar only if somebody says which."""
+    """A `TwoToARow` has two residuals in each row, which have one inner scalar only if the term says which."""
 
     def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
         return super().residual(field, state, where).expand(-1, -1, 2)
@@ -315,7 +315,7 @@ def test_two_residuals_of_a_row_need_a_jacobian_by_hand() -> None:
 
 
 def of_offset(_: CarBatch, state: CarState) -> Tensor:
-    """Pulls an unknown offset of the disparity to a pixel; nothing where the rig is known."""
+    """A term that pulls an unknown disparity offset to a pixel; it is absent if the rig is known."""
     return state.offset_px - 1.0
 
 
@@ -364,7 +364,7 @@ def test_what_begins_a_term_with_a_jacobian_needs_none_itself() -> None:
 
 
 class TensorTerm(LowerTerm):
-    """Looks at rows of one tensor, without a tuple around it."""
+    """A `TensorTerm` looks at rows of one tensor, without a tuple around it."""
 
     def where(self, sight: Sight) -> Where:
         return torch.ones(len(self.blocks.owner), 1)
@@ -381,7 +381,7 @@ def test_two_terms_of_one_name_are_named() -> None:
 
 
 def _poisoned(name: str, when: Callable[[CarState], Tensor]) -> Callable[[CarBatch, CarState], PriorResidual]:
-    """The first detection's residual or Jacobian is no number where the condition (B,) on the state holds."""
+    """A term whose residual or Jacobian of the first detection is NaN where a condition (B,) on the state is true."""
 
     def residual(cars: CarBatch, state: CarState) -> PriorResidual:
         at = lower_by(0.0)(cars, state)

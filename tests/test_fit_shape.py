@@ -1,4 +1,4 @@
-"""Shapes from points alone: surfaces of known cars, seen from one side and from all, in the frame of a LiDAR."""
+"""Shapes are fitted to points on surfaces of known cars, from one side and from all, in the frame of a LiDAR."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def scanned_dataset(root: Path) -> tuple[Path, Path]:
-    """A data set of one frame with a scan of two cars and a file of their boxes; nothing else, no image."""
+    """A data set of one frame with a scan of two cars and a file of their boxes, without images."""
     points, _ = cars(False)  # in the frame of a LiDAR
     T_cam_velo = torch.tensor([[0.0, -1, 0, 0.1], [0, 0, -1, -0.1], [1, 0, 0, 12.0], [0, 0, 0, 1]]).double()
     training, boxes = root / "training", root / "boxes"

@@ -1,4 +1,4 @@
-"""From a detector's tensors to a refinement and back: no file, no conversion of one's own."""
+"""A detector's tensors are refined and returned without files or conversions by the user."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever a user has allowed for a network, here products have all digits; afterwards the setting is as it was."""
+"""Products have all digits whatever a user has allowed for a network, and the setting is unchanged afterwards."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Masks as crops: nothing is lost, whatever form masks come in, and what is in none takes no memory."""
+"""Mask crops lose nothing, for every form of masks, and take no memory for empty parts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from directshape_torch.masks import MaskCrops
 
 
 def plain_extents(masks: Tensor) -> tuple[list[list[int]], list[int]]:
-    """Boxes and areas of the foreground, of every pixel of every mask, one mask at a time."""
+    """Boxes and areas of the foreground from every pixel of every mask, one mask at a time."""
     boxes, areas = [], []
     for mask in masks:
         v, u = (~(mask <= 0.5)).nonzero(as_tuple=True)

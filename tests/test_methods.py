@@ -1,4 +1,4 @@
-"""Whole refinements by point cloud, alone and beside the images."""
+"""These tests run whole refinements by point cloud, alone and with the images."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def refine(config: RefinerConfig, frames: FrameBatch, detections: Detections) ->
 
 @cache
 def refined(method: str) -> RefinementResult:
-    """The scene by these settings; nobody changes it."""
+    """The result for the scene with these settings, which must not be changed."""
     return refine(CONFIGS[method], *scene_of())
 
 
@@ -89,7 +89,7 @@ def test_a_batch_equals_a_loop_and_order_does_not_matter(method: str) -> None:
 
 
 def _hide(frames: FrameBatch, mask: Tensor, left_over: int) -> FrameBatch:
-    """The frames without disparity inside a mask (H, W), but for some pixels."""
+    """The frames without disparity inside a mask (H, W), except for some pixels."""
     assert frames.disparity is not None
     pixels = (mask > 0.5).nonzero()[left_over:]
     disparity = frames.disparity.clone()

@@ -1,6 +1,6 @@
-"""Whole refinements on a device whose tensors do not mix with the processor's (`helpers.pretended_card`).
+"""Whole refinements run on a device whose tensors do not mix with the CPU's (`helpers.pretended_card`).
 
-It stands in for a graphics card where there is none: what is left on the wrong device, and what lets the host wait.
+It takes the place of a graphics card and finds tensors left on the wrong device and waits of the host.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _COMPARED = [
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What `helpers.card_cases` finds, once for all: the device belongs to its process."""
+    """The results of `helpers.card_cases`, computed once in a separate process, to which the device belongs."""
     file = tmp_path_factory.mktemp("card") / "found.json"
     paths = [str(_TESTS), str(_TESTS.parent), os.environ.get("PYTHONPATH", "")]
     done = subprocess.run(

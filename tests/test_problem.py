@@ -1,4 +1,4 @@
-"""The energy of many cars: one cost, sums, cars apart, stages that hold unknowns, and the way there."""
+"""These tests check the energy of many cars: one cost, sums, independence of cars, stages, and steps."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SETS = {"demo": "noisy_stereo", "rendered": "stereo", "kitti": "noisy_stereo"}
 
 @pytest.fixture(autouse=True)
 def no_graph() -> object:
-    """As in the iterations, which differentiate nothing."""
+    """The mode of the iterations, which differentiate nothing."""
     with torch.no_grad():
         yield
 
@@ -56,10 +56,10 @@ def begun_stage(config: RefinerConfig = DEFAULT, number: int = 1) -> tuple[CarSt
 
 
 def _gradient_error(stage: CarStage, state: CarState, names: tuple[str, ...]) -> Tensor:
-    """Of the gradient by central differences of the cost, looked at anew at every state; relative, of each car.
+    """Relative error (B,) of the gradient by central differences of the cost, which looks anew at every state.
 
-    Where a ray changes, within a step, from one of its minima to another the cost jumps, which the narrower of two
-    steps is spared.
+    If a ray changes between two of its minima within a step, the cost jumps; the smaller error of two steps avoids
+    this.
     """
     of_terms = [number for number, name in enumerate(stage.problem.term_names) if name in names]
     analytic = figures_at(stage, state).gradient[:, of_terms].sum(dim=1)
@@ -236,7 +236,7 @@ def test_stages_of_the_geometric_method_alternate() -> None:
 
 
 def _biased_street(bias_px: int, rows: int = 0) -> tuple[FrameBatch, Detections]:
-    """The street as a rig would see it whose right image comes out `bias_px` further left and `rows` lower."""
+    """The street for a rig whose right image is `bias_px` further left and `rows` lower."""
     scene = cached_street()[1]
     camera = scene.frames.camera
     height, width = scene.frames.images_left.shape[2:]

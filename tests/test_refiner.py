@@ -1,4 +1,4 @@
-"""The refiner as a module: batching, order, determinism, dtypes, padding, stored state, borders."""
+"""These tests check the refiner as a module: batching, order, determinism, dtypes, padding, stored state, borders."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def two_frames() -> tuple[FrameBatch, Detections, list[tuple[FrameBatch, Detecti
 
 @lru_cache(maxsize=1)
 def refined_frames() -> RefinementResult:
-    """That batch by the default settings; nobody changes it."""
+    """The batch refined with the default settings, which must not be changed."""
     return refiner()(*two_frames()[:2])
 
 

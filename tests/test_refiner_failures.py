@@ -1,4 +1,4 @@
-"""A car that cannot be refined says why, gets its input back to the bit, and touches no other car."""
+"""A car that cannot be refined says why, gets its input back to the bit, and does not affect other cars."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def with_third(change: Callable[[Detections], Detections]) -> tuple[FrameBatch, 
 
 
 def assert_others_unchanged(result: RefinementResult) -> None:
-    """To the bit if the bad car never reached the solver; else to rounding, for it leaves the batch at another time."""
+    """Assert equality to the bit if the bad car never reached the solver, else to rounding as it left the batch."""
     expected = healthy()
     tolerance = 0.0 if result.cost_before[2].isnan().all() else 1e-11
     for name in ("T_cam_obj", "code", "status_code", "iterations", "cost_before", "cost_after"):

@@ -1,4 +1,4 @@
-"""Blocks of 64 rows: layout, joining, leaving cars out, their sums against loops over rows, and rays in blocks."""
+"""These tests check blocks of 64 rows: layout, joining, omitted cars, sums against loops, and rays in blocks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a refinement is given: shapes are checked, wrong input is named with a cure; statuses and errors."""
+"""Inputs of a refinement are checked for shapes, and wrong input is named with a cure; statuses have meanings."""
 
 from __future__ import annotations
 
@@ -213,7 +213,7 @@ def pinhole(
 
 
 def beside(T_cam_world: torch.Tensor, *shift: float) -> torch.Tensor:
-    """The left camera moved along its own axes, its own transform kept."""
+    """The left camera moved along its own axes, with its own transform unchanged."""
     T_right_cam = torch.eye(4).to(T_cam_world)
     T_right_cam[:3, 3] = -T_cam_world.new_tensor(shift)
     return T_right_cam @ T_cam_world

@@ -1,4 +1,4 @@
-"""A tiny data set from images to files: what a run writes."""
+"""These tests check what a run writes from images to files, on a tiny data set."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_cars_come_nearer_to_the_truth(shared_kitti: Path, tmp_path: Path) -> No
 
 @pytest.fixture(scope="module")
 def out(shared_kitti: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with everything that it may write."""
+    """A run with all optional outputs."""
     out = tmp_path_factory.mktemp("out")
     refine(shared_kitti, out, meshes="ply", overlays=True)
     return out

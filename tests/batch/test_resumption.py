@@ -1,4 +1,4 @@
-"""A second run into a folder: what it does again, what it leaves alone, what it refuses."""
+"""A second run into a folder repeats what is missing, keeps what is finished and refuses other inputs."""
 
 from __future__ import annotations
 

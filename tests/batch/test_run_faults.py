@@ -1,4 +1,4 @@
-"""Runs that are killed, cut short, crowded out: the next run ends with the bytes of one that nothing happened to."""
+"""After runs that are killed, cut short or crowded out, the next run ends with the bytes of an undisturbed run."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def children(pid: int) -> list[int]:
 
 
 def is_running(pid: int) -> bool:
-    """Whether a process is there and is more than an entry that its new parent has not cleared away yet."""
+    """Whether a process exists and is more than an entry that its parent has not removed yet."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):

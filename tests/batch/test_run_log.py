@@ -1,4 +1,4 @@
-"""One run at a time in a folder, whoever was killed there before, and what its log says, wherever it is cut."""
+"""Only one run at a time holds a folder, and its log can be read after a kill or a cut at any place."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_a_folder_whose_place_a_file_takes_holds_nothing(tmp_path: Path) -> None
 
 def test_what_a_full_disk_took_of_a_line_is_taken_back(tmp_path: Path) -> None:
     class Disk:
-        """Takes ten bytes and no more."""
+        """Take ten bytes and fail."""
 
         def __init__(self, file: object) -> None:
             self.file, self.left = file, 10

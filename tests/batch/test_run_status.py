@@ -1,4 +1,4 @@
-"""What a run tells of itself, from the log that it leaves at each moment."""
+"""The status of a run follows from the log at each moment."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TODO = tuple(f"{number:06d}" for number in range(10, 20))
 
 
 def begun(out: Path, *lines: Mapping[str, Any], num_frames: int = 12, **changes: Any) -> None:
-    """A run of twelve frames, two of them of an earlier run, whose frames are refined since second 1000."""
+    """A run of twelve frames, two of them from an earlier run, that refines since second 1000."""
     with RunLog(out) as log:
         log.begin(RunBeginning(WORK, num_frames, **{"started_at": 990.0, **changes}))
     with log_path(out).open("a") as file:
@@ -26,7 +26,7 @@ def begun(out: Path, *lines: Mapping[str, Any], num_frames: int = 12, **changes:
 
 
 def frames(times: list[float], failed: str = "") -> list[dict[str, Any]]:
-    """Lines of the frames that ended at these times, after the one that says that the check is over."""
+    """Lines of frames that ended at these times, after the line of the finished check."""
     ends = [
         {"frame": frame_id, "at": time, "failure": "cut short" if frame_id == failed else None}
         for frame_id, time in zip(TODO, times, strict=False)

@@ -1,4 +1,4 @@
-"""What a run says about itself: counts, warnings, exit code, times."""
+"""These tests check the summary of a run: counts, warnings, exit code, times."""
 
 from __future__ import annotations
 

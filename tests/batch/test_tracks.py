@@ -1,4 +1,4 @@
-"""`refine --tracks`: the frames of a track in one call, its file at the end, resumption that keeps to its windows."""
+"""`refine --tracks` refines the frames of a track in one call, writes its file and resumes with the same windows."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from directshape_torch.tracks import same_car
 
 @pytest.fixture(scope="module")
 def sequence(shared_kitti: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The frames of the shared data set as a sequence, every car with the track of its line."""
+    """The frames of the shared data set as a sequence; the track of every car is its line."""
     root = tmp_path_factory.mktemp("sequence")
     write_sequence(shared_kitti, root, FRAMES, single=True)
     write_tracked(shared_kitti / "detections" / "data", FRAMES, root / "results" / f"{root.name}.txt")

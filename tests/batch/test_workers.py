@@ -1,4 +1,4 @@
-"""What happens to frames of workers that die, and real processes: the bytes of one, whatever happens to them."""
+"""Frames of workers that die are repeated, and real processes give the same bytes whatever happens to them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ DONE: FrameEntry = {"state": "done"}
 
 
 class Imagined:
-    """Workers that die of what they are told to; the latest group comes back first."""
+    """An `Imagined` has workers that die as they are told; the latest group returns first."""
 
     def __init__(self, capacity: int, dies: Callable[[FrameGroup, int], bool]) -> None:
         self.capacity, self.dies = capacity, dies
@@ -149,7 +149,7 @@ def test_a_worker_without_the_memory_for_a_call_halves_it(root: Path, tmp_path: 
 
 
 def fails_once(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
-    """The first report that this process receives ends in an error."""
+    """A wrapper that makes the first received report end in an error."""
     receive, errors = Connection.recv, [error]
 
     def recv(pipe: Connection) -> object:
@@ -183,7 +183,7 @@ def test_a_worker_that_dies_within_its_report_is_replaced(
 
 def test_what_cannot_be_sent_to_a_worker_says_so(root: Path, tmp_path: Path) -> None:
     class Nameless(QuickRefiner):
-        """Of this function: another process cannot import it."""
+        """A `Nameless` is local to this function, so another process cannot import it."""
 
     with pytest.raises(DirectShapeError, match=r"cannot be sent to other processes.*Nameless"):
         refine(root, tmp_path, Nameless(root), batch_frames=1, workers=1)

@@ -66,7 +66,7 @@ def test_two_cars_say_nothing_of_a_third(meshes, tmp_path, capsys):
 
 
 def turned(meshes: Path, folder: Path, axes: Sequence[int], scale: float, suffixes: str = ".obj .ply .off") -> Path:
-    """The meshes with their axes in another order and another unit."""
+    """The meshes with exchanged axes and another unit."""
     folder.mkdir(exist_ok=True)
     for file in meshes.iterdir():
         if file.suffix in suffixes.split():

@@ -1,4 +1,4 @@
-"""`directshape demo`: a table, a picture and a scene from the bundled frame, by the way of `refine`."""
+"""`directshape demo` writes a table, a picture and a scene from the bundled frame, in the same way as `refine`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`directshape evaluate`: what it prints and writes, and its errors."""
+"""These tests check the output, the files and the errors of `directshape evaluate`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CAR = "Car 0 0 {alpha} 100 100 200 150 1.5 2 4 0 1.6 {z} 0"
 
 @pytest.fixture
 def folders(tmp_path: Path) -> tuple[str, str]:
-    """45 frames of one car each, 15 m away, all found; the last frame has no result file."""
+    """Folders of 45 frames with one car each, 15 m away, all found; the last frame has no result file."""
     labels, results = tmp_path / "labels", tmp_path / "results" / "data"
     for folder in (labels, results):
         folder.mkdir(parents=True)

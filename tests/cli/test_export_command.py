@@ -1,4 +1,4 @@
-"""`directshape export` as a user types it."""
+"""These tests run `directshape export` as a user types it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`directshape inspect`: every figure of a car of the bundled frame, moving pictures of tracks, clear refusals."""
+"""`directshape inspect` draws every figure of a car, animates tracks and refuses wrong use clearly."""
 
 from __future__ import annotations
 

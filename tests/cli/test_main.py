@@ -1,4 +1,4 @@
-"""The program's commands, its one-line errors and its exit codes."""
+"""These tests check the program's commands, its one-line errors and its exit codes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`directshape refine` as a user types it."""
+"""These tests run `directshape refine` as a user types it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`directshape refine --lidar` as a user types it: scans in KITTI's format, missing, damaged and exchanged ones."""
+"""These tests run `directshape refine --lidar` with scans in KITTI's format, also missing or wrong ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`directshape refine --method` and `--disparity` as a user types them."""
+"""These tests run `directshape refine --method` and `--disparity` as a user types them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ QUICK = ("--set", "point_cloud.rounds=1", "point_cloud.min_points=50", "stages=[
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two frames and their exact disparity, one file named as KITTI Stereo 2015 does."""
+    """Two frames and their exact disparity, one file with the name of KITTI Stereo 2015."""
     import torch
 
     root = tmp_path_factory.mktemp("kitti")

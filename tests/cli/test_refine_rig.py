@@ -1,4 +1,4 @@
-"""`directshape refine --rig`: estimated once for each calibration, kept, shown, or taken from a file."""
+"""`directshape refine --rig` estimates a rig for each calibration, keeps it, shows it, or reads it from a file."""
 
 from __future__ import annotations
 

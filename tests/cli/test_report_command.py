@@ -1,4 +1,4 @@
-"""`directshape report`: the page, what it says on the way, and wrong usage."""
+"""These tests check the page of `directshape report`, its messages and wrong usage."""
 
 from __future__ import annotations
 

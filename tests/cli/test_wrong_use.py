@@ -1,4 +1,4 @@
-"""Wrong use of the commands: exit code 2, one line that says what was expected, and nothing written."""
+"""Wrong use of the commands gives exit code 2, one line with the expectation, and no files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One test per numbered sentence of CONVENTIONS.md, and one that the numbers match."""
+"""Each numbered sentence of CONVENTIONS.md has one test, and one test checks that the numbers match."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The bundled frame with files that are broken, and what is said about it; one mistake in the numbers of each kind.
+"""These tests break files of the bundled frame and check the findings, for one mistake in the numbers of each kind.
 
-Of other mistakes in the numbers tells `scripts/scene_mistakes.py`.
+`scripts/scene_mistakes.py` has the other mistakes in the numbers.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ BOXES, MASKS, PLANE = "detections/data/000000.txt", "training/masks/000000.json"
 
 @pytest.fixture(scope="module", autouse=True)
 def match_once() -> Any:
-    """The same images give the same answer: matching is the slow part, and most breaks leave the images alone."""
+    """Cache matches by image content, because matching is slow and most breaks do not change the images."""
     answers: dict[bytes, Any] = {}
     match_pair = check_images.match_pair
 
@@ -79,7 +79,7 @@ def text(name: str, change: Callable[[str], str]) -> Break:
 
 
 def boxes(change: Callable[[list[str]], object]) -> Break:
-    """`change(words)` in place for each line: h w l at 8, x y z at 11, rotation_y at 14."""
+    """A break that applies `change(words)` in place to each line: h w l at 8, x y z at 11, rotation_y at 14."""
 
     def changed(line: str) -> str:
         words = line.split()
@@ -103,7 +103,7 @@ def cut_short(words: list[str]) -> None:
 
 
 def masks(**changes: Callable[[Any], Any]) -> Break:
-    """Changes of keys of each entry, whose boxes and soft masks go."""
+    """A break that changes keys of each mask entry and removes its box and soft mask."""
 
     def changed(entry: dict[str, Any]) -> dict[str, Any]:
         kept = {key: value for key, value in entry.items() if key not in ("bbox", "soft_probability")}
@@ -113,7 +113,7 @@ def masks(**changes: Callable[[Any], Any]) -> Break:
 
 
 def raw_right(content: str) -> str:
-    """Another row and column of the centre of P3."""
+    """A break that moves the centre of P3 to another row and column."""
     lines = [line.split() for line in content.splitlines()]
     for words in (words for words in lines if words[0] == "P3:"):
         words[3], words[7] = f"{float(words[3]) - 14}", f"{float(words[7]) - 7}"
@@ -125,7 +125,7 @@ def cut(name: str) -> Break:
 
 
 def row_by_row(segmentation: dict[str, Any]) -> dict[str, Any]:
-    """Run lengths along the rows in the place of those down the columns."""
+    """A break that writes run lengths along the rows in place of the columns."""
     height, width = segmentation["size"]
     inside = decode_segmentation(Path("masks.json"), "entry", segmentation, (height, width))
     pixels = inside.ravel(order="C")
@@ -135,7 +135,7 @@ def row_by_row(segmentation: dict[str, Any]) -> dict[str, Any]:
 
 
 def in_16_bits(bits: int) -> Break:
-    """Both images as a camera of so many bits gives them."""
+    """A break that stores both images as a camera of the given number of bits does."""
 
     def apply(root: Path) -> None:
         for name in (LEFT, RIGHT):
@@ -146,7 +146,7 @@ def in_16_bits(bits: int) -> Break:
 
 
 def images(change: Callable[[Any], Any], *names: str) -> Break:
-    """Changes of the pixels of some images."""
+    """A break that changes the pixels of some images."""
 
     def apply(root: Path) -> None:
         for name in names:

@@ -1,4 +1,4 @@
-"""Single checks on numbers whose answer is known."""
+"""These tests check single checks with numbers whose answer is known."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every command in README and docs is understood by the program, and so are its settings."""
+"""The program accepts every command in README and docs, and their settings exist."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def commands(page: Path) -> list[str]:
-    """Arguments of `directshape` in the shell blocks of a page, those that are spelled out."""
+    """Arguments of the fully written `directshape` commands in the shell blocks of a page."""
     blocks = re.findall(r"```bash\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     lines = [line for block in blocks for line in re.sub(r"\\\n", " ", block).splitlines()]
     found = [line.removeprefix("directshape ") for line in lines if line.startswith("directshape ")]

@@ -1,4 +1,4 @@
-"""docs/extra_terms.md and docs/how_it_works.md name what exists."""
+"""docs/extra_terms.md and docs/how_it_works.md name parts that exist."""
 
 from __future__ import annotations
 

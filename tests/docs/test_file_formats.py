@@ -32,7 +32,7 @@ def section(heading: str) -> str:
 
 
 def table_names(text: str) -> set[str]:
-    """The words in code type of the first column of a table."""
+    """The words in code type in the first column of a table."""
     cells = [line.split("|")[1] for line in text.splitlines() if line.startswith("|")]
     return {name for cell in cells for name in re.findall(r"`([^`]+)`", cell)}
 

@@ -1,4 +1,4 @@
-"""docs/outputs.md and docs/exports.md: their names are those of the code, and their Python runs."""
+"""The names in docs/outputs.md and docs/exports.md are those of the code, and their Python runs."""
 
 from __future__ import annotations
 

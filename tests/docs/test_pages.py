@@ -1,4 +1,4 @@
-"""Every page says first what it answers, and its links lead to files and headings that exist."""
+"""Every page begins with the question that it answers, and its links lead to existing files and headings."""
 
 from __future__ import annotations
 

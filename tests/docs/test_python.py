@@ -1,4 +1,4 @@
-"""Python in README and docs calls what exists, with arguments that it takes."""
+"""The Python in README and docs calls existing functions with arguments that they accept."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def calls_of(page: Path) -> Iterator[tuple[ast.Call, Callable[..., object]]]:
-    """Calls of what a page imports from the package, those whose arguments are spelled out."""
+    """Fully written calls of objects that a page imports from the package."""
     imported: dict[str, object] = {}
     for code in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
         if "--8<--" in code:

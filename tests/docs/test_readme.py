@@ -1,4 +1,4 @@
-"""The README's Python runs as it stands, its commands are those that CI runs."""
+"""The README's Python runs unchanged, and its commands are those of CI."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def tensors_of_the_bundled_frame() -> dict[str, object]:
-    """What a detector would give, by the names of the README."""
+    """Outputs of a detector for the bundled frame, by the names of the README."""
     loaded = demo_dataset().load("000000")
     frame, found = loaded.frame, loaded.detections
     return {

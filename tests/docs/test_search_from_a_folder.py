@@ -1,4 +1,4 @@
-"""The search of the documentation finds pages that were opened from a folder, and asks no network for anything."""
+"""The search of the documentation works in pages opened from a folder, without a network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bootstrap over cars: against closed forms and numpy's own statistics."""
+"""The bootstrap over cars agrees with closed forms and numpy's own statistics."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Comparison of result folders: a small data set whose every figure is derived by hand."""
+"""The figures of a comparison of result folders agree with values derived by hand for a small data set."""
 
 import csv
 import json
@@ -39,9 +39,9 @@ def _write(folder: Path, **frames: list[str]) -> Path:
 
 @pytest.fixture
 def folders(tmp_path: Path) -> tuple[Path, Path, Path]:
-    """Boxes are 4 x 2 m along x: a shift by s in x leaves the overlap (4 - s) / (4 + s).
+    """Folders with boxes of 4 x 2 m along x, for which a shift by s in x gives an IoU of (4 - s) / (4 + s).
 
-    Before: shifts 2, 1, 0.4. After: 0, 1, 1. The small label and the occluded one do not count.
+    The shifts are 2, 1, 0.4 before and 0, 1, 1 after. The small label and the occluded one do not count.
     """
     labels = _write(
         tmp_path / "labels",

@@ -1,4 +1,4 @@
-"""Average precision as KITTI measures it: figures by hand, frames and files; the devkit is another file's reference."""
+"""KITTI's average precision agrees with figures by hand, for frames and files; another file has the devkit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Average precision as KITTI measures it: a slow reference, and known scores of real detectors."""
+"""KITTI's average precision agrees with a slow reference, and with known scores of real detectors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Frames = list[tuple[list[KittiObject], list[KittiObject]]]
 
 
 def scenes(seed: int) -> Frames:
-    """Frames whose boxes crowd together, with equal scores and overlaps, and labels at the limits."""
+    """Frames with crowded boxes, with equal scores and overlaps, and with labels at the limits."""
     one_of = random.Random(seed).choice
 
     def thing(kinds: tuple[str, ...], scores: tuple[str, ...]) -> str:

@@ -1,4 +1,4 @@
-"""Detections find their labels; labels count or do not."""
+"""Detections are matched to their labels, and labels count or do not."""
 
 import pytest
 

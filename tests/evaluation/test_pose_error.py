@@ -1,4 +1,4 @@
-"""Errors of boxes against hand-derived numbers."""
+"""Errors of boxes agree with hand-derived numbers."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Overlap of rotated boxes: hand-derived numbers, OpenCV, laws."""
+"""The IoU of rotated boxes agrees with hand-derived numbers and OpenCV, and obeys its laws."""
 
 import math
 
@@ -23,7 +23,7 @@ def _random_boxes(count: int, seed: int) -> torch.Tensor:
 
 
 def _reference_intersection(a: torch.Tensor, b: torch.Tensor) -> float:
-    """OpenCV's, in float32; its angles count from x towards z, a heading from x away from z."""
+    """The intersection by OpenCV in float32; its angles count from x towards z, but a heading from x away from z."""
     rectangles = [
         ((x, z), (length, width), -math.degrees(yaw)) for x, z, length, width, yaw in (a.tolist(), b.tolist())
     ]

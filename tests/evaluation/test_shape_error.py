@@ -1,4 +1,4 @@
-"""Figures of sets of points by hand, and where the points of estimated and true surfaces lie."""
+"""Figures of point sets agree with values by hand, and points of surfaces lie where they should."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shapes of a whole refinement against true surfaces: a tiny street whose truth is known, and a real frame."""
+"""Shapes of a whole refinement are compared with true surfaces of a tiny street and of a real frame."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ T_CAM_OBJ = pose_from_kitti(torch.tensor(TWO_CARS[0], dtype=torch.float64), torc
 
 
 def write_truth(root: Path, prior: PCAShapePrior) -> None:
-    """True disparities and depths, with nothing of the library's ray casting; the cars are the same in every frame."""
+    """Write true disparities and depths without the library's ray casting; the cars are the same in every frame."""
     scene = street(prior, *TWO_CARS, code=torch.tensor(CODE, dtype=torch.float64))
     camera, disparity = scene.frames.camera, scene.disparity[0]
     v, u = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
@@ -48,7 +48,7 @@ def write_truth(root: Path, prior: PCAShapePrior) -> None:
 
 
 def write_perfect(source: Path, target: Path) -> None:
-    """The shape files of `source` with the true poses and codes."""
+    """Write the shape files of `source` with the true poses and codes."""
     for frame_id in FRAMES:
         shapes = read_shapes(source / "shapes" / f"{frame_id}.npz")
         perfect = dataclasses.replace(shapes, codes=np.array(CODE), T_cam_obj=T_CAM_OBJ.numpy())
@@ -57,7 +57,7 @@ def write_perfect(source: Path, target: Path) -> None:
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data set, `refined` (one step of a refinement) and `perfect`."""
+    """A data set with `refined` (one step of a refinement) and `perfect` results."""
     root = tmp_path_factory.mktemp("kitti")
     prior = write_data_set(root, FRAMES)
     write_truth(root, prior)

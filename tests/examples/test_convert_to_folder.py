@@ -1,4 +1,4 @@
-"""The bundled frame as a rig of another's own, converted by the example and read again."""
+"""The example converts the bundled frame from a rig of another user, and the result is read again."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "convert_to_folder.py"
 
 
 def write_rig(demo: LoadedFrame, root: Path) -> None:
-    """The frame as its detector and OpenCV would have it."""
+    """Write the frame in the forms of its detector and of OpenCV."""
     for side, folder in (("left", "image_2"), ("right", "image_3")):
         put(DEMO / "training" / folder / "000000.png", root / side / "street.png")
     camera = demo.frame.camera

@@ -1,4 +1,4 @@
-"""The examples of the guide run, and give what they promise."""
+"""The examples of the guide run and give what they promise."""
 
 from __future__ import annotations
 

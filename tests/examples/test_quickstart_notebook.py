@@ -13,7 +13,7 @@ NOTEBOOK = Path(__file__).parents[2] / "examples" / "quickstart.ipynb"
 
 
 def executed(cells: list[dict[str, Any]]) -> dict[str, Any]:
-    """The names after all cells of code, each run as the notebook shows it."""
+    """The variables after all code cells, each run as the notebook shows it."""
     names: dict[str, Any] = {"__name__": "__main__"}
     for number, cell in enumerate(cells):
         if cell["cell_type"] == "code":

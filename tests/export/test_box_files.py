@@ -26,7 +26,7 @@ def exported(finished: FinishedRun, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 def corners_ref(run: FinishedRun, frame_id: str, car: int) -> NDArray[np.float64]:
-    """The corners that state and size of the npz file give by this package's own formula, sorted."""
+    """Corners from the state and size in the npz file by this package's own formula, sorted."""
     state = run.state(frame_id)
     T = torch.from_numpy(state["T_ref_obj"][car].astype(np.float64)).clone()
     T[:3, 3] = torch.from_numpy(state["boxes_location_ref"][car].astype(np.float64))

@@ -37,7 +37,7 @@ Place = tuple[int | None, int | None]
 
 
 class Recording:
-    """All rows of an .rrd file: for each entity and component the values by (frame, iteration)."""
+    """A `Recording` has all rows of an .rrd file: for each entity and component the values by (frame, iteration)."""
 
     def __init__(self, path: Path) -> None:
         from rerun.chunk import RrdReader
@@ -58,7 +58,7 @@ class Recording:
         return self.rows[entity, component]
 
     def at(self, entity: str, component: str, frame: int) -> Any:
-        """The value of a frame, wherever on the other timeline."""
+        """The value of a frame, at any place on the other timeline."""
         (value,) = [value for place, value in self.of(entity, component).items() if place[0] == frame]
         return value
 
@@ -112,7 +112,7 @@ def test_frames_and_iterations_are_timelines(recording: Recording) -> None:
 
 
 def second_frame(recording: Recording) -> list[int]:
-    """The iterations of the second frame, which begin where its images are."""
+    """The iterations of the second frame, which begin at its images."""
     begin = max(place[1] or 0 for place in recording.of("/world/cam/image", "blob"))
     return [place[1] for place in recording.of("/terms/000001/1/height", "scalars") if place[1] >= begin]
 

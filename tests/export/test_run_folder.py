@@ -1,4 +1,4 @@
-"""What exports read of a run."""
+"""These tests check what exports read of a run."""
 
 from __future__ import annotations
 

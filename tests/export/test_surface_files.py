@@ -38,7 +38,7 @@ def exported(finished: FinishedRun, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 class Glb:
-    """A binary glTF file as pygltflib reads it."""
+    """A `Glb` is a binary glTF file as pygltflib reads it."""
 
     def __init__(self, path: Path) -> None:
         from pygltflib import GLTF2
@@ -62,7 +62,7 @@ class Glb:
         return np.frombuffer(content, kind, accessor.count * width).reshape(-1, width)
 
     def matrix(self, name: str) -> Floats:
-        """Node to world; glTF stores columns first."""
+        """The transform from a node to the world; glTF stores columns first."""
         return np.array(self.nodes[name].matrix).reshape(4, 4).T
 
     def extras(self, name: str) -> dict[str, object]:
@@ -75,7 +75,7 @@ def glb(path: Path) -> Glb:
 
 
 def distances(run: FinishedRun, frame_id: str, car: int, points_cam: Floats) -> Floats:
-    """How far points are from the surface that the npz describes, by the signed distance field itself."""
+    """Distances of points from the surface that the npz describes, by the signed distance field itself."""
     arrays = run.state(frame_id)
     T = arrays["T_cam_obj"][car].astype(np.float64)
     points_obj = (points_cam - T[:3, 3]) @ T[:3, :3]
@@ -85,20 +85,20 @@ def distances(run: FinishedRun, frame_id: str, car: int, points_cam: Floats) -> 
 
 
 def extents(run: FinishedRun, frame_id: str, car: int, points_cam: Floats) -> Floats:
-    """Height, width, length of points along the axes of the car."""
+    """Height, width and length of points along the axes of the car."""
     R = run.state(frame_id)["T_cam_obj"][car][:3, :3].astype(np.float64)
     length, height, width = np.ptp(points_cam @ R, axis=0)
     return np.array([height, width, length])
 
 
 def srgb(linear: NDArray[np.generic]) -> Floats:
-    """16 bits of glTF's linear colours as the bytes of an image."""
+    """Bytes of an image for 16-bit linear colours of glTF."""
     c = linear.astype(np.float64) / 65535
     return 255 * np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.maximum(c, 1e-9) ** (1 / 2.4) - 0.055)
 
 
 def image_at(run: FinishedRun, frame_id: str, points_cam: Floats) -> Floats:
-    """The left image where points appear, by OpenCV's interpolation."""
+    """The left image at the projections of points, by OpenCV's interpolation."""
     uv = points_cam @ run.P_left(frame_id)[:, :3].T
     uv = (uv[:, :2] / uv[:, 2:]).astype(np.float32)[:, None]
     bgr = cv2.imread(str(run.root / f"training/image_2/{frame_id}.png"))
@@ -182,7 +182,7 @@ def test_glb_carries_what_is_known_of_a_car(finished: FinishedRun, exported: Pat
 def with_tracks(
     finished: FinishedRun, folder: Path, tracks: tuple[str, str], parts: Sequence[Sequence[int]]
 ) -> RunFolder:
-    """A copy of the run whose cars have tracks; `parts` of each frame."""
+    """A copy of the run whose cars have tracks, with `parts` for each frame."""
     shutil.copytree(finished.out, folder)
     for frame_id, part in zip(("000000", "000001"), parts, strict=True):
         path = folder / "shapes" / f"{frame_id}.npz"

@@ -1,4 +1,4 @@
-"""Which points of two ellipsoid cars are seen, against the equation of the ellipsoids."""
+"""The visible points of two ellipsoid cars agree with the equation of the ellipsoids."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def surface(car: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def hidden_behind(points_cam: NDArray[np.float64], car: int) -> NDArray[np.bool_]:
-    """Whether the sight to each point meets the ellipsoid of a car before the point: a quadratic equation."""
+    """Whether the ray to each point meets the ellipsoid of a car before the point, by a quadratic equation."""
     T = T_CAM_OBJ[car].numpy()
     start = (-T[:3, 3] @ T[:3, :3] - CENTRE_OBJ) / HALF_AXES
     way = points_cam @ T[:3, :3] / HALF_AXES

@@ -1,4 +1,4 @@
-"""Writers leave the whole new file or the whole old one, and equal bytes for equal content."""
+"""Writers leave the complete new file or the complete old one, with equal bytes for equal content."""
 
 from __future__ import annotations
 

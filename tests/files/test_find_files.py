@@ -1,4 +1,4 @@
-"""Files are found as users have them: endings in capitals, composed letters or not; hidden files are nobody's."""
+"""Files are found with upper-case endings and with any encoding of accents; hidden files are ignored."""
 
 from __future__ import annotations
 

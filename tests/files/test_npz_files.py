@@ -1,4 +1,4 @@
-"""An npz file comes back as it was written, and whatever is none is refused by name."""
+"""An npz file is read as it was written, and any other file is refused with its name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Texts as other programs write them: with a mark of their encoding, with the line ends of any system."""
+"""Texts of other programs are read, with a mark of their encoding and with the line ends of any system."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MARKED = ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "u
 
 
 def encoded(text: str, encoding: str) -> bytes:
-    """The text with the mark that programs put before it."""
+    """The text with the mark that programs write before it."""
     mark = "\ufeff" if encoding in ("utf-16-le", "utf-16-be", "utf-32-be") else ""
     return (mark + text).encode(encoding)
 

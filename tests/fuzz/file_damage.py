@@ -1,4 +1,4 @@
-"""One thing wrong in a file: in its bytes, or in what they say."""
+"""This module makes one change in a file, in its bytes or in its content."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WORDS = ("", "nan", "inf", "-1", "1e400", "9" * 5000, "\u0663", "0x10", "1_0", "
 
 
 def damaged(content: bytes, name: str, chance: random.Random) -> bytes:
-    """Content with one thing wrong, in its bytes or in its structure."""
+    """The content with one change in its bytes or in its structure."""
     if chance.random() < 0.3:
         return _bytes(content, chance)
     if name.endswith(".json"):
@@ -53,7 +53,7 @@ def _bytes(content: bytes, chance: random.Random) -> bytes:
 
 
 def _node(value: Any, chance: random.Random) -> Any:
-    """With an odd value in the place of one within it, a key too many or one too few."""
+    """The value with an odd value in place of one within it, or with a key more or less."""
     if not isinstance(value, (dict, list)) or not value or chance.random() < 0.15:
         return chance.choice(ODD)
     keys = list(value) if isinstance(value, dict) else list(range(len(value)))
@@ -106,7 +106,7 @@ def _archive(content: bytes, chance: random.Random) -> bytes:
 
 
 def _scene(content: bytes, chance: random.Random) -> bytes:
-    """Its description changed, its numbers as they are."""
+    """The file of a scene with a changed description and unchanged numbers."""
     (length,) = struct.unpack_from("<I", content, 12)
     text = json.dumps(_node(json.loads(content[20 : 20 + length]), chance)).encode()
     text += b" " * (-len(text) % 4)
@@ -115,7 +115,7 @@ def _scene(content: bytes, chance: random.Random) -> bytes:
 
 
 def _image(content: bytes, chance: random.Random) -> bytes:
-    """Whole, but of another size, depth, number of channels, or with odd values."""
+    """A complete image of another size, depth or number of channels, or with odd values."""
     image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     assert image is not None, "damage starts from a whole image"
     odd = (

@@ -1,4 +1,4 @@
-"""A small file of every format that the program reads, and who reads it."""
+"""This module has a small file of every format that the program reads, with its reader."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ VELODYNE = "R0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 
 
 @dataclass(frozen=True)
 class Sample:
-    """A whole file, and what reads it and all that follows from it.
+    """A `Sample` is a complete file with the function that reads it and uses the content.
 
     Attributes:
-        path: the file.
-        read: reads it.
-        is_exact: damage is an error; a reader that is not skips what it cannot use, and says how much.
+        path: path of the file.
+        read: function that reads the file.
+        is_exact: whether damage is an error; other readers skip what they cannot use, and report how much.
     """
 
     path: Path
@@ -65,7 +65,7 @@ class Sample:
 
 
 def samples(kitti: Path, folder: Path) -> dict[str, Sample]:
-    """By format; `kitti` is copied and stays as it is."""
+    """Samples by format; `kitti` is copied and stays unchanged."""
     assert set(BUNDLED_PRIORS) == {"pca", "neural"}
     root = Path(shutil.copytree(kitti, folder / "kitti"))
     found = {
@@ -130,7 +130,7 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
 
 
 def _masks(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[Path], object]]]:
-    """Masks of the whole set in one file, and as numbers of instances in an image."""
+    """Masks of the whole set in one file, and as instance numbers in an image."""
     entries = json.loads((root / "masks" / f"{FRAME}.json").read_text())
     coco, ids = folder / "left.json", folder / "instance_2" / f"{FRAME}.png"
     left = [{"image_id": 0, "bbox": [1, 1, 9, 9], "score": 0.5} | e for e in entries if e["image"] == "left"]
@@ -151,7 +151,7 @@ def _masks(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[Path], o
 
 
 def _frames(root: Path, folder: Path) -> dict[str, Sample]:
-    """Files of a frame, in the layouts that have others than the rest."""
+    """Files of a frame in layouts that have their own files."""
     training, plain, sequence = root / "training", folder / "plain", folder / "tracking"
     write_folder(root, plain, FRAMES)
     drive = write_raw(root, folder / "raw", FRAMES)
@@ -189,7 +189,7 @@ def _frames(root: Path, folder: Path) -> dict[str, Sample]:
 
 
 def _runs(root: Path, out: Path) -> dict[str, Sample]:
-    """What a run leaves, and whoever goes on from there."""
+    """Files of a run, with the readers that resume or use them."""
     refine(root, out, overlays=True)
 
     def report() -> object:

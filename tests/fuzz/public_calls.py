@@ -1,4 +1,4 @@
-"""What a user calls with tensors and numbers, and the same with one odd value in the place of any of them."""
+"""This module has public calls with tensors and numbers, and replaces any argument by an odd value."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ Arguments = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Call:
-    """A call with good arguments.
+    """A `Call` is a call with good arguments.
 
     Attributes:
         arguments: tensors, records of tensors, numbers, texts.
-        run: gives what must be finite where the call is accepted.
-        promises: whatever came in; else only where that was finite.
+        run: function that returns the values which must be finite if the call is accepted.
+        promises: whether results are finite for any input, or only for finite input.
     """
 
     arguments: Arguments
@@ -59,7 +59,7 @@ class Call:
     promises: bool = False
 
     def places(self) -> list[Place]:
-        """Whatever an odd value can stand in the place of."""
+        """All places that an odd value can take."""
         found: list[Place] = []
         for name, value in self.arguments.items():
             found += list(places(value, (name,))) if is_dataclass(value) else [(name,)]
@@ -68,11 +68,11 @@ class Call:
 
 @dataclass(frozen=True)
 class OddCall:
-    """A call with an odd value in one place, which `outcome` makes.
+    """An `OddCall` is a call with an odd value in one place; `outcome` runs it.
 
     Attributes:
-        name: of the call and the place, for whoever must find it again.
-        keeps_finite: whether what it gives must be finite.
+        name: names of the call and of the place, to find it again.
+        keeps_finite: whether its results must be finite.
     """
 
     name: str
@@ -82,13 +82,13 @@ class OddCall:
     keeps_finite: bool
 
     def outcome(self) -> bool:
-        """Whether all is finite that must be; raises what the call raises."""
+        """Whether all values are finite that must be; the errors of the call are raised."""
         found = self.call.run(_changed(self.call.arguments, self.place, self.value))
         return not self.keeps_finite or all(bool(x.detach().isfinite().all()) for x in found)
 
 
 def odd_call(chance: random.Random, name: str | None = None) -> OddCall:
-    """Any call, or the one of that name, with one odd value."""
+    """Any call, or the call with the given name, with one odd value."""
     name = name or chance.choice(list(calls()))
     call = calls()[name]
     place = chance.choice(call.places())
@@ -109,7 +109,7 @@ def odd_call(chance: random.Random, name: str | None = None) -> OddCall:
 
 
 def odd_numbers(name: str) -> Iterator[OddCall]:
-    """The call of that name with each odd value in the place of each argument that is no tensor."""
+    """The named call with each odd value in place of each argument that is not a tensor."""
     call = calls()[name]
     for place in call.places():
         if not isinstance(at(call.arguments[place[0]], place[1:]), Tensor):
@@ -119,7 +119,7 @@ def odd_numbers(name: str) -> Iterator[OddCall]:
 
 
 def setting(chance: random.Random) -> str:
-    """`KEY=VALUE` of a setting that exists."""
+    """A text `KEY=VALUE` with a setting that exists."""
     group, key = chance.choice(_settings())
     value = chance.choice(
         ("-1", "0", "1", "2", "0.5", "1e-30", "1e30", ".nan", ".inf", "x", "null", "true", "[]", "[1]")
@@ -135,7 +135,7 @@ def _settings() -> list[tuple[str, str]]:
 
 @cache
 def calls() -> dict[str, Call]:
-    """All of them, by name."""
+    """All calls, by name."""
     frames, detections = whole_call()
     camera, prior = frames.camera, ellipsoid_prior()
     P_left = torch.cat([camera.K_left, torch.zeros(1, 3, 1)], dim=2).double()
@@ -191,7 +191,7 @@ def calls() -> dict[str, Call]:
 
 @cache
 def whole_call() -> tuple[FrameBatch, Detections]:
-    """A call with every tensor that one can have."""
+    """A call with every tensor that a call can have."""
     _, street = cached_street()
     masks = torch.zeros_like(street.detections.mask_left.dense()[:1])
     masks[0, 0, 0] = 1.0
@@ -228,7 +228,7 @@ def _loaded(a: Arguments) -> RefinementResult:
 
 
 def _gradient(a: Arguments) -> list[Tensor]:
-    """By the images, the masks and the input poses, of what was accepted."""
+    """Gradients by the images, the masks and the input poses, if the call was accepted."""
     wanted = [a["frames"].images_left, a["detections"].mask_left.dense(), a["detections"].T_cam_obj]
     leaves = [x.detach().clone().requires_grad_() if x.is_floating_point() else x for x in wanted]
     frames = replace(a["frames"], images_left=leaves[0])
@@ -257,7 +257,7 @@ _PRIOR_TENSORS = (
 
 
 def _prior(a: Arguments) -> list[Tensor]:
-    """A prior that was accepted must do for a refinement."""
+    """The result of a refinement with a prior that was accepted."""
     named = {name: a[name] for name in _PRIOR_TENSORS[3:]}
     prior = PCAShapePrior(
         *(a[name] for name in (*_PRIOR_TENSORS[:3], "spacing_m")), **named, provenance=PriorProvenance("", "", 1)
@@ -339,7 +339,7 @@ def _result() -> RefinementResult:
 
 
 def places(record: Any, path: Place = ()) -> Iterator[Place]:
-    """The fields of a record of tensors and of further such records."""
+    """The fields of a record of tensors and of the records in it."""
     for each in fields(record):
         value = getattr(record, each.name)
         if isinstance(value, Tensor):
@@ -349,12 +349,12 @@ def places(record: Any, path: Place = ()) -> Iterator[Place]:
 
 
 def at(record: Any, path: Place) -> Any:
-    """What stands there."""
+    """The value at a place."""
     return record if not path else at(getattr(record, path[0]), path[1:])
 
 
 def changed(record: Any, path: Place, value: object) -> Any:
-    """The record with another value there, all its checks done anew."""
+    """The record with another value at a place, after all of its checks."""
     inner = value if len(path) == 1 else changed(getattr(record, path[0]), path[1:], value)
     return replace(record, **{path[0]: inner})
 

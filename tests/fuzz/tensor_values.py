@@ -1,4 +1,4 @@
-"""Odd values in the place of a tensor or a number."""
+"""This module has odd values that replace a tensor or a number."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Damaged files of every format are refused by an error of ours that names the file, or read."""
+"""Damaged files of every format are read, or refused by an error of the package that names the file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever stands in the place of an argument is refused by name, or taken into finite numbers."""
+"""Any value in place of an argument is refused by name, or gives finite numbers."""
 
 from __future__ import annotations
 

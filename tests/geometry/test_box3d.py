@@ -1,4 +1,4 @@
-"""KITTI boxes to and from poses, with numbers by hand."""
+"""KITTI boxes and poses agree in both directions with numbers by hand."""
 
 from __future__ import annotations
 

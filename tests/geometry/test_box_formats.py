@@ -1,4 +1,4 @@
-"""Boxes as detectors write them: one car standing at a known place, written by hand in every convention."""
+"""Boxes of detectors are read in every convention, from one car at a known place written by hand."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_every_convention_says_the_same_car(convention: BoxFormat) -> None:
 
 
 def tools_corners(convention: BoxFormat) -> torch.Tensor:
-    """Corners by each tool's own recipe, from its own numbers."""
+    """Corners by each tool's own formula, from its own numbers."""
     x, y, z, *sizes, yaw = WRITTEN[convention]
     c, s = math.cos(yaw), math.sin(yaw)
     unravelled = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])[[0, 1, 3, 2, 4, 5, 7, 6]].double()

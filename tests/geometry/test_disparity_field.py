@@ -1,4 +1,4 @@
-"""The field: its basis, its tame continuation, its file, and its refusal of other rigs."""
+"""These tests check the disparity field: its basis, bounded continuation, file, and refusal of other rigs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Boxes in images: overlap, and those around projected 3D boxes."""
+"""These tests check the IoU of boxes in images and the boxes around projected 3D boxes."""
 
 from __future__ import annotations
 

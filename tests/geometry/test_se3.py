@@ -1,4 +1,4 @@
-"""Rigid motions against the matrix exponential, kornia's Lie groups and what they must satisfy, in every regime."""
+"""Rigid motions agree with the matrix exponential, kornia's Lie groups and their laws, in every regime."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lengths of vectors, flags together and cross products, against PyTorch's own."""
+"""Lengths of vectors, joined flags and cross products agree with PyTorch's own."""
 
 from __future__ import annotations
 

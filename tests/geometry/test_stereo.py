@@ -1,4 +1,4 @@
-"""Projection, and crossing to the right image: warp, its derivative, rays of the right camera, the rig's bias."""
+"""These tests check projection and the right image: warp, its derivative, rays of the right camera, the rig's bias."""
 
 from __future__ import annotations
 

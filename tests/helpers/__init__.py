@@ -1,1 +1,1 @@
-"""What several test files share: small shapes, scenes and derivatives that are easy to trust."""
+"""This package has small shapes, scenes and simple derivatives that several test files share."""

@@ -1,4 +1,4 @@
-"""A real headless Chromium, driven by Selenium."""
+"""This module drives a real headless Chromium with Selenium."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _FLAGS = (
 
 @contextmanager
 def chromium() -> Iterator[Chrome]:
-    """A browser; skips the test where there is none."""
+    """A browser; the test is skipped without one."""
     webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium (the extra test)")
     program = shutil.which("chromium") or shutil.which("chromium-browser")
     driver = shutil.which("chromedriver")
@@ -49,7 +49,7 @@ def chromium() -> Iterator[Chrome]:
 
 
 def set_viewport(browser: Chrome, width: int, height: int = 900, *, dark: bool = False) -> None:
-    """The size of the page and the colours that its user likes."""
+    """Set the size of the page and the colour scheme that its user prefers."""
     size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
@@ -57,7 +57,7 @@ def set_viewport(browser: Chrome, width: int, height: int = 900, *, dark: bool =
 
 
 def requested_urls(browser: Chrome) -> list[str]:
-    """Every address that was asked for since the last call, but for data inside the page."""
+    """Every address requested since the last call, except data inside the page."""
     messages = (json.loads(entry["message"])["message"] for entry in browser.get_log("performance"))
     urls = [m["params"]["request"]["url"] for m in messages if m["method"] == "Network.requestWillBeSent"]
     return [url for url in urls if not url.startswith("data:")]

@@ -1,4 +1,4 @@
-"""Calls of any number of cars."""
+"""This module makes calls of any number of cars."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from directshape_torch.scene import Detections, FrameBatch
 
 
 def with_cars(frames: Sequence[LoadedFrame], num_cars: int) -> tuple[FrameBatch, Detections]:
-    """One call of exactly so many cars: the frames over and over, of the last one its first cars."""
+    """One call of exactly the given number of cars: repeated frames, the last one with only its first cars."""
     chosen: list[LoadedFrame] = []
     missing = num_cars
     while missing > 0:
@@ -24,5 +24,5 @@ def with_cars(frames: Sequence[LoadedFrame], num_cars: int) -> tuple[FrameBatch,
 
 
 def first_cars(loaded: LoadedFrame, count: int) -> LoadedFrame:
-    """A frame of which only the first cars are refined; the others are not there, so that they hide nothing either."""
+    """A frame with only its first cars; the others are absent, so they hide nothing."""
     return replace(loaded, detections=loaded.detections.rows(torch.arange(count)))

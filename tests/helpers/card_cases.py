@@ -1,6 +1,7 @@
-"""Refinements on the processor and on a pretended card, in a process of their own: `python -m helpers.card_cases FILE`.
+"""This module compares refinements on the CPU and a simulated card in a separate process.
 
-Writes a JSON object: for each case the largest difference, or what the waits of the host were.
+`python -m helpers.card_cases FILE` writes a JSON object: for each case the largest difference, or the waits of the
+host.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ UNROLLED = replace(_FEW_STEPS, backward=replace(DEFAULT.backward, mode="unroll")
 
 
 def compare(config: RefinerConfig, prior: ShapePrior | None = None, tracks: bool = False) -> dict[str, float]:
-    """The largest difference between the devices of each figure, its gradients among them."""
+    """The largest difference between the devices of each figure and its gradients."""
     if config.method == "direct":
         street_prior, frames, detections = _numbered() if tracks else five_cars()
     else:
@@ -76,7 +77,7 @@ def compare(config: RefinerConfig, prior: ShapePrior | None = None, tracks: bool
 
 
 def _numbered() -> tuple[ShapePrior, FrameBatch, Detections]:
-    """The five cars, those of one shape as views of one."""
+    """The five cars, with cars of equal shape as views of one track."""
     prior, frames, detections = five_cars()
     return prior, frames, replace(detections, track_id=torch.tensor([0, 1, -1, 0, 1]))
 
@@ -84,7 +85,7 @@ def _numbered() -> tuple[ShapePrior, FrameBatch, Detections]:
 def _figures(
     refiner: DirectShapeRefiner, frames: FrameBatch, detections: Detections, device: torch.device
 ) -> dict[str, Tensor]:
-    """All tensors of a result, on the processor; they must have been on the device."""
+    """All tensors of a result, on the CPU; they must have been on the device."""
     differentiate = refiner.config.backward.mode != "none"
     images = frames.images_right.detach().clone().requires_grad_(differentiate)
     weights = {"shape": torch.linspace(0.5, 1.0, len(detections), dtype=images.dtype, device=device)}
@@ -122,7 +123,7 @@ def _difference(found: Tensor, expected: Tensor) -> float:
 
 
 def waits_of_blocks(tracks: bool = False) -> dict[str, Any]:
-    """Of the iterations of a refinement: what the host waits for between the beginnings and ends of stages."""
+    """Waits of the host between the begin and end of stages, in the iterations of a refinement."""
     prior, frames, detections = _numbered() if tracks else five_cars()
     # Else all of the toys stay until the last block of a stage.
     config = with_solver(_SHIPPED, cost_tolerance=0.01)
@@ -143,7 +144,7 @@ def waits_of_blocks(tracks: bool = False) -> dict[str, Any]:
 
 
 def waits_of_masks() -> dict[str, Any]:
-    """How often the host waits while it makes crops of few masks and of many, by their form."""
+    """Number of waits of the host while it makes crops of few masks and of many, by their form."""
 
     forms: dict[str, Callable[[Tensor], Any]] = {
         "dense": MaskCrops.of,
@@ -167,7 +168,7 @@ def waits_of_masks() -> dict[str, Any]:
 
 
 def waits_of_nothing() -> dict[str, Any]:
-    """That what is to be noted is: a program that mixes devices, and one that reads."""
+    """The noted waits of a program that mixes devices, and of one that reads, which must be noted."""
     x = torch.arange(6, device=CARD).view(2, 3)
     problems = []
     number, of_card = torch.tensor(1.0), x[0, 0].float()

@@ -1,4 +1,4 @@
-"""A small lookup to compile, with two varying sizes, as the hot functions have them."""
+"""This module has a small function to compile with two varying sizes, as the hot functions have."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler on
 
 
 class Tables(NamedTuple):
-    """What is looked up in."""
+    """A `Tables` has the values of the lookup."""
 
     grid: Tensor  # (B, 4, 4)
     scale: float
@@ -40,7 +40,7 @@ def nearest_values(points: Tensor, tables: Tables, car: Tensor) -> tuple[Tensor,
 
 
 def nearest_inputs(num_points: int, num_cars: int) -> tuple[Tensor, Tables, Tensor]:
-    """Arguments for it."""
+    """Arguments of `nearest_values`."""
     generator = torch.Generator().manual_seed(num_points)
     car = torch.arange(num_points) % num_cars
     grid = torch.rand(num_cars, 4, 4, generator=generator)
@@ -48,19 +48,19 @@ def nearest_inputs(num_points: int, num_cars: int) -> tuple[Tensor, Tables, Tens
 
 
 def new_compilable(function: Callable[..., Any], sizes: dict[str, int]) -> Compilable[..., Any]:
-    """A function to be compiled. Compiled code hangs on the code object, so each test has one of its own."""
+    """A new function to be compiled; each test needs its own, because compiled code belongs to the code object."""
     code = function.__code__.replace()
     return compilable(sizes)(types.FunctionType(code, function.__globals__, function.__name__))
 
 
 @pytest.fixture
 def nearest() -> Nearest:
-    """The function to be compiled, as yet plain."""
+    """The function to be compiled, in its plain form."""
     return new_compilable(nearest_values, {"points": 0, "grid": 0, "car": 0})
 
 
 def trace_only(monkeypatch: pytest.MonkeyPatch, backend: Callable[..., Any] | str = "aot_eager") -> None:
-    """What would be compiled is traced and then run by `backend`: no C++ compiler, and seconds instead of a minute."""
+    """Trace code that would be compiled and run it by `backend`, without a C++ compiler and in seconds."""
     monkeypatch.setattr(compile_module, "compiler_problem", lambda: None)
     compile_it = torch.compile
 
@@ -71,11 +71,11 @@ def trace_only(monkeypatch: pytest.MonkeyPatch, backend: Callable[..., Any] | st
 
 
 def graphs() -> int:
-    """How many the compiler has traced."""
+    """Number of graphs that the compiler has traced."""
     return int(counters["stats"]["unique_graphs"])
 
 
 @pytest.fixture
 def fresh_compiler_counts() -> None:
-    """What the compiler has counted in other tests is forgotten."""
+    """Reset the counts of the compiler from other tests."""
     counters.clear()

@@ -1,4 +1,4 @@
-"""Derivatives by the tangent of the state, by central differences and by autograd."""
+"""This module computes derivatives by the tangent of the state, by central differences and by autograd."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from directshape_torch.state.unknowns import AnyState, State
 def moved(state: AnyState, delta: Tensor) -> AnyState:
     """The state at `delta` (B, D) of its own tangent, by the definition of CONVENTIONS.md; differentiable.
 
-    Poses are moved by `exp` from the left, everything else by addition.
+    Poses are moved by `exp` from the left, other unknowns by addition.
     """
     first, parts = 0, []
     for value in state:

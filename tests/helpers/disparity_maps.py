@@ -1,4 +1,4 @@
-"""Disparity maps as a stereo method would write them for KITTI."""
+"""This module writes disparity maps as a stereo method would for KITTI."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from directshape_torch.files.atomic_files import write_png
 
 
 def write_disparity(path: Path, disparity: NDArray[np.floating]) -> None:
-    """Write (H, W) pixels: NaN and what is not positive as unknown, values rounded to 1/256 pixel."""
+    """Write (H, W) pixels; NaN and values that are not positive become unknown, others are rounded to 1/256 pixel."""
     known = np.isfinite(disparity) & (disparity > 0)
     units = np.round(np.where(known, disparity, 0) * 256).clip(0, np.iinfo(np.uint16).max)
     write_png(path, units.astype(np.uint16))

@@ -1,4 +1,4 @@
-"""Ellipsoids: as a field with known geometry, and as a small prior whose code stretches the half axes."""
+"""This module has ellipsoids as a field with known geometry, and as a small prior whose code changes the half axes."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ AXES_STD_M = 0.12
 
 
 class Ellipsoid:
-    """`sdf = scale (|(X - centre) / half_axes| - 1)`, a `BoundShape` without code; its zero level is exact.
+    """An `Ellipsoid` is the field `scale (|(X - centre) / half_axes| - 1)`, a `BoundShape` without code.
 
-    With equal half axes `radius` and `scale = radius` it is the true distance to a sphere.
+    Its zero level is exact. With equal half axes `radius` and `scale = radius` it is the true distance to a sphere.
     """
 
     def __init__(self, half_axes: Tensor, centre: Tensor, scale: float) -> None:
@@ -42,14 +42,14 @@ class Ellipsoid:
 
 
 def _distance(points: Tensor, half_axes: Tensor) -> Tensor:
-    """Distance to an ellipsoid, right at the surface and to first order near it."""
+    """Distance to an ellipsoid, exact at the surface and correct to first order near it."""
     level = (points / half_axes).norm(dim=-1).clamp_min(1e-3)
     slope = (points / half_axes**2).norm(dim=-1).clamp_min(1e-3)
     return level * (level - 1) / slope
 
 
 def ellipsoid_prior(dtype: torch.dtype = torch.float64, num_codes: int = 3, spacing_m: float = 0.2) -> PCAShapePrior:
-    """An ellipsoid standing on the ground; code k changes half axis k (length, height, width) by about 0.12 m each."""
+    """A prior of ellipsoids on the ground; code k changes half axis k (length, height, width) by about 0.12 m."""
     lower = torch.tensor([-2.8, -2.2, -1.6], dtype=torch.float64)
     upper = torch.tensor([2.8, 0.8, 1.6], dtype=torch.float64)
     counts = ((upper - lower) / spacing_m).round().long() + 1

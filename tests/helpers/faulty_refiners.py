@@ -1,4 +1,4 @@
-"""Refiners that do to their process what happens in the field; classes, so that workers can be sent them."""
+"""This module has refiners that disturb their process; they are classes, so that they can be sent to workers."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ def few_steps() -> RefinerConfig:
 
 
 class QuickRefiner(DirectShapeRefiner):
-    """Two iterations, with the prior of a data set of `helpers.kitti_folder`."""
+    """A `QuickRefiner` has two iterations, with the prior of a data set of `helpers.kitti_folder`."""
 
     def __init__(self, root: Path) -> None:
         super().__init__(PCAShapePrior.load(root / "prior.safetensors"), few_steps())
 
 
 class DeadlyRefiner(QuickRefiner):
-    """Kills its process, as the system does when memory runs out, where one of some frames is in the call.
+    """A `DeadlyRefiner` kills its process, as the system does without memory, if certain frames are in the call.
 
     Args:
-        root: of the data set.
+        root: root of the data set.
         always: frames that kill each time.
-        once: frames that kill the first time, by a note in the folder `notes`.
+        once: frames that kill only the first time, recorded by a file in the folder `notes`.
     """
 
     def __init__(self, root: Path, notes: Path, always: Collection[str] = (), once: Collection[str] = ()) -> None:
@@ -59,7 +59,7 @@ class DeadlyRefiner(QuickRefiner):
 
 
 class HungryRefiner(QuickRefiner):
-    """Needs a gigabyte for a call of several frames, which its process may not have."""
+    """A `HungryRefiner` needs a gigabyte for a call of several frames, which its process may not have."""
 
     def forward(self, frames: FrameBatch, *args: Any) -> RefinementResult:
         import resource
@@ -76,7 +76,7 @@ class HungryRefiner(QuickRefiner):
 
 
 class SlowRefiner(QuickRefiner):
-    """Takes its time, so that there is some to be killed in."""
+    """A `SlowRefiner` sleeps, so that a test has time to kill it."""
 
     def forward(self, *args: Any) -> RefinementResult:
         time.sleep(0.5)

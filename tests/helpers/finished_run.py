@@ -1,4 +1,4 @@
-"""A small finished run: frames and classes of any name, each with two ellipsoid cars and a pedestrian."""
+"""This module makes a small finished run with frames and classes of any name, two ellipsoid cars and a pedestrian."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FRAMES = ("000000", "000001")
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A data set in KITTI's layout, and the folder of its refinement."""
+    """A `FinishedRun` is a data set in KITTI's layout with the folder of its refinement."""
 
     root: Path
     out: Path
@@ -42,7 +42,7 @@ class FinishedRun:
         return RunFolder(self.out, frames or None)
 
     def state(self, frame_id: str) -> dict[str, NDArray[Any]]:
-        """What the npz of a frame holds."""
+        """The content of the npz of a frame."""
         with np.load(self.out / "shapes" / f"{frame_id}.npz", allow_pickle=False) as file:
             return dict(file)
 
@@ -54,7 +54,7 @@ class FinishedRun:
     def inputs(
         self, run: RunFolder | None = None, *, with_images: bool = True, has_detections: bool = True
     ) -> RunInputs:
-        """What a page or an export may use, of all frames or of those of a folder."""
+        """The inputs of a page or an export, of all frames or of those of a folder."""
         dataset = self.dataset if with_images else None
         return RunInputs(self.folder() if run is None else run, self.prior, dataset, has_detections)
 
@@ -79,7 +79,7 @@ def finished_run(
 
 
 def by_place(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points in an order of their own: by their places along three directions that no box is aligned with."""
+    """Points sorted by their positions along three directions that no box is aligned with."""
     return points[np.argsort(points @ np.array([1.0, 0.0123, 0.345]))]
 
 

@@ -1,4 +1,4 @@
-"""Five cars in two frames of different sizes, one behind another: a batch in which nothing is the same for all."""
+"""This module has a batch of five cars in two frames of different sizes that hide each other, without symmetries."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ from helpers.synthetic_scene import CAMERA_HEIGHT_M, disturbed, joined_detection
 
 @lru_cache(maxsize=1)
 def five_cars() -> tuple[PCAShapePrior, FrameBatch, Detections]:
-    """Rendered once a test session in float64; the detections are disturbed. The second and third car stand partly
-    behind the first, as does the fifth behind the fourth."""
+    """The five cars with disturbed detections, rendered once for all tests in float64.
+
+    The second and third car are partly behind the first, and the fifth is behind the fourth.
+    """
     prior = ellipsoid_prior()
     code = torch.tensor([[0.8, -0.5, 0.6], [-0.7, 0.4, 0.5], [0.1, 0.9, -0.6]], dtype=torch.float64)
     y = CAMERA_HEIGHT_M
@@ -30,12 +32,12 @@ def five_cars() -> tuple[PCAShapePrior, FrameBatch, Detections]:
 
 
 def with_solver(config: RefinerConfig, **changes: object) -> RefinerConfig:
-    """Other settings of the solver."""
+    """The settings with other values of the solver."""
     return replace(config, solver=replace(config.solver, **changes))  # type: ignore[arg-type]
 
 
 def step_of(num_cars: int, motion: float, code: float, seed: int = 7) -> Tensor:
-    """A seeded step (B, 9): standard deviations in metres and radians, and of the code."""
+    """A seeded step (B, 9) with standard deviations in metres and radians, and of the code."""
     generator = torch.Generator().manual_seed(seed)
     scale = torch.tensor([motion] * 6 + [code] * 3, dtype=torch.float64)
     return scale * torch.randn(num_cars, 9, generator=generator, dtype=torch.float64)

@@ -1,6 +1,6 @@
-"""KITTI's evaluation as its C++ devkit (2017) does it: one frame, one label, one detection after the other.
+"""This module is KITTI's evaluation as in its C++ devkit (2017): frame by frame, label by label.
 
-The slow and readable reference for the vectorised evaluation.
+It is the slow and readable reference for the vectorised evaluation.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ NEIGHBOUR = {"Car": "Van", "Pedestrian": "Person_sitting"}
 
 @cache
 def overlap(metric: str, a: KittiObject, b: KittiObject, over_first: bool = False) -> float:
-    """Of image boxes as the devkit has it; that of boxes in space is held against OpenCV in `test_rotated_iou`."""
+    """Overlap of image boxes as in the devkit; `test_rotated_iou` compares boxes in space with OpenCV."""
     if metric != "2d":
         boxes, others = boxes_of([a]), boxes_of([b])
         return float(iou_3d(boxes, others) if metric == "3d" else bev_iou(bev_boxes(boxes), bev_boxes(others)))
@@ -90,7 +90,7 @@ def _statistics(
     minimum_iou: float,
     threshold: float | None,
 ) -> tuple[list[float], int, float]:
-    """Scores of right detections, number of wrong ones, and orientation similarity; no threshold: the first pass."""
+    """Scores of right detections, number of wrong ones, orientation similarity; without threshold the first pass."""
     labels, detections = frame
     assigned = [False] * len(detections)
     low = [threshold is not None and float(d.score or 0) < threshold for d in detections]

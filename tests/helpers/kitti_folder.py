@@ -1,4 +1,4 @@
-"""A tiny ray-cast street as a data set in KITTI's layout, with exact labels and masks and noisy detections."""
+"""This module writes a tiny ray-cast street in KITTI's layout, with exact labels and masks and noisy detections."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CODE = ((0.8, -0.5, 0.6), (-0.7, 0.4, 0.5))
 
 
 def write_data_set(root: Path, frame_ids: tuple[str, ...] = FRAMES) -> PCAShapePrior:
-    """Frames with the same two cars and other detections in each; also `root/prior.safetensors` of the cars' shapes."""
+    """Write frames of two cars with different detections, and `root/prior.safetensors` with the cars' shapes."""
     prior = ellipsoid_prior()
     prior.save(root / "prior.safetensors")
     scene = street(prior, *TWO_CARS, code=torch.tensor(CODE, dtype=prior.mean.dtype))
@@ -32,13 +32,13 @@ def write_data_set(root: Path, frame_ids: tuple[str, ...] = FRAMES) -> PCAShapeP
 
 
 def input_options(root: Path, masks: bool = True) -> list[str]:
-    """What `directshape refine` takes from such a data set, on the CPU."""
+    """The input options of `directshape refine` for such a data set, on the CPU."""
     words = ["--data", root, "--detections", root / "detections", "--prior", root / "prior.safetensors"]
     return [*map(str, words + (["--masks", root / "masks"] if masks else [])), "--device", "cpu"]
 
 
 def write_frame(root: Path, frame_id: str, scene: Street, detections: Detections) -> None:
-    """Everything of one frame under `root/training`, `root/masks` and `root/detections`."""
+    """Write the files of one frame under `root/training`, `root/masks` and `root/detections`."""
     training, frames = root / "training", scene.frames
     for folder, image in (("image_2", frames.images_left), ("image_3", frames.images_right)):
         write_png(training / folder / f"{frame_id}.png", (255 * image[0]).round().byte().permute(1, 2, 0).numpy())

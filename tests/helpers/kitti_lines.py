@@ -1,4 +1,4 @@
-"""Cars as lines of KITTI label and result files, each in a place of its own, and the scores of a frame of them."""
+"""This module has cars as separate lines of KITTI label and result files, and the scores of a frame of them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def line(
     alpha: float = 0,
     score: float | None = None,
 ) -> str:
-    """A car 4 m x 2 m x 1.5 m in a place of its own, in the image 300 px and on the road 10 m from the next."""
+    """A car of 4 m x 2 m x 1.5 m in its own place, 300 px in the image and 10 m on the road from the next."""
     box_2d = f"{300 * slot} 100 {300 * slot + 100} {100 + height}"
     text = f"{kind} {truncated} {occluded} {alpha} {box_2d} 1.5 2 4 {10 * slot} 1.6 20 0"
     return text if score is None else f"{text} {score}"

@@ -1,4 +1,4 @@
-"""The frames of `helpers.kitti_folder` in the other layouts, file by file as those data sets have them."""
+"""This module writes the frames of `helpers.kitti_folder` in the other layouts, with their own files."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def write(path: Path, text: str) -> None:
 
 
 def raw_calibration(kitti: Path, frame_id: str) -> str:
-    """`calib_cam_to_cam.txt`: other names, further lines that are no numbers."""
+    """The text of `calib_cam_to_cam.txt`, with other names and with lines that are not numbers."""
     text = (kitti / "training" / "calib" / f"{frame_id}.txt").read_text()
     return "calib_time: 09-Jan-2012 13:57:47\n" + text.replace("P2:", "P_rect_02:").replace("P3:", "P_rect_03:")
 
 
 def write_raw(kitti: Path, root: Path, frame_ids: tuple[str, ...]) -> Path:
-    """A drive below its day; returns the drive."""
+    """Write a drive below its day and return the drive."""
     drive = root / DAY / DRIVE
     write(drive.parent / "calib_cam_to_cam.txt", raw_calibration(kitti, frame_ids[0]))
     for number, frame_id in enumerate(frame_ids):
@@ -44,7 +44,7 @@ def write_raw(kitti: Path, root: Path, frame_ids: tuple[str, ...]) -> Path:
 
 
 def write_sequence(kitti: Path, root: Path, frame_ids: tuple[str, ...], single: bool) -> None:
-    """One tracking sequence as a folder, or the benchmark's tree with one sequence."""
+    """Write one tracking sequence as a folder, or the benchmark's tree with one sequence."""
     base = root if single else root / "training"
     for number, frame_id in enumerate(frame_ids):
         for folder, source in (("image_02", "image_2"), ("image_03", "image_3"), ("planes", "planes")):
@@ -58,7 +58,7 @@ def write_sequence(kitti: Path, root: Path, frame_ids: tuple[str, ...], single: 
 
 
 def write_odometry(kitti: Path, root: Path, frame_ids: tuple[str, ...], sequence: str = "04") -> None:
-    """One sequence of the odometry benchmark with times and poses; its calibration has `Tr:` and no `R0_rect:`."""
+    """Write one sequence of the odometry benchmark with times and poses; its calibration has `Tr:`, no `R0_rect:`."""
     base = root / "sequences" / sequence
     for number, frame_id in enumerate(frame_ids):
         for folder in ("image_2", "image_3"):
@@ -73,7 +73,7 @@ def write_odometry(kitti: Path, root: Path, frame_ids: tuple[str, ...], sequence
 
 
 def write_tracked(source: Path, frame_ids: tuple[str, ...], to: Path, tracks: Iterable[int] | None = None) -> None:
-    """One file of the frames of a folder, each object with the track of its line, by default its number."""
+    """Write one file for the frames of a folder, with a track for each line, by default its number."""
     lines = [(source / f"{frame_id}.txt").read_text().splitlines() for frame_id in frame_ids]
     ids = list(range(max(map(len, lines))) if tracks is None else tracks)
     write(
@@ -82,7 +82,7 @@ def write_tracked(source: Path, frame_ids: tuple[str, ...], to: Path, tracks: It
 
 
 def write_stereo2015(kitti: Path, root: Path, frame_ids: tuple[str, ...]) -> None:
-    """Both pairs of each scene, the second the same as the first."""
+    """Write both pairs of each scene, the second equal to the first."""
     for frame_id in frame_ids:
         for pair in ("10", "11"):
             for folder in ("image_2", "image_3"):
@@ -95,7 +95,7 @@ def write_stereo2015(kitti: Path, root: Path, frame_ids: tuple[str, ...]) -> Non
 
 
 def write_folder(kitti: Path, root: Path, frame_ids: tuple[str, ...]) -> None:
-    """The plain folder, boxes moved from ref to the left camera and with their masks beside them."""
+    """Write the plain folder, with boxes in left camera coordinates and with the masks beside them."""
     calibration = read_calibration(kitti / "training" / "calib" / f"{frame_ids[0]}.txt")
     camera = to_stereo_camera(calibration)
     t_cam_ref = [float(value) for value in camera.t_cam_ref[0].double()]

@@ -1,4 +1,4 @@
-"""Lookups in stacks of images, coordinates together."""
+"""This module looks up values in stacks of images by joint coordinates."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def bilinear_with_gradient(
     uv: Tensor,  # (..., 2)
     sizes: Tensor | None = None,  # (F, 2) height and width without padding
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Value (...), gradient (..., 2) and whether inside (...)."""
+    """Values (...), gradients (..., 2) and whether points are inside (...)."""
     height, width = images.shape[1:]
     last_row, last_column = (height - 1, width - 1) if sizes is None else (sizes - 1)[frame_index].unbind(-1)
     first = frame_index * (height * width)

@@ -1,4 +1,4 @@
-"""Which instance of a mask file each detection of a frame got."""
+"""This module tells which instance of a mask file each detection of a frame got."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 
 
 def instances(dataset: StereoDataset, loaded: LoadedFrame) -> tuple[list[int], list[int]]:
-    """Numbers of the file for the left and for the right image, -1 for none."""
+    """Instance numbers of the file for the left and for the right image, -1 for none."""
     height, width = loaded.frame.sizes[0].tolist()
     masks = [] if dataset.masks is None else dataset.masks.read(loaded.frame_id, (height, width))
 

@@ -1,4 +1,4 @@
-"""What a run has left in its output folder."""
+"""This module lists the files of a run in its output folder."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def result_files(folder: Path) -> dict[str, bytes]:
-    """All files but those that tell of the run itself, by name."""
+    """All files by name, except those about the run itself."""
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))

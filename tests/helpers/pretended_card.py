@@ -1,12 +1,12 @@
-"""A device that keeps its tensors to itself as a graphics card does, in the memory of the processor.
+"""This module simulates a device that keeps its tensors apart, like a graphics card, in the memory of the CPU.
 
-`torch.device("card")` has every operation that PyTorch has on a processor, computed there, so results are the same to
-the bit. But tensors of both do not mix, numbers go over only where the program says so, and each time that the host has
-to wait for the device is noted with its place, as far as operations tell it by their names. It is stricter than a real
-card with indices that lie on the processor. What a real card does of its own (other kernels, other orders of sums,
-memory) it does not show.
+`torch.device("card")` has every operation that PyTorch has on a CPU, computed there, so results are equal to the bit.
+But tensors of both devices cannot be mixed, numbers are copied only where the program says so, and each wait of the
+host for the device is noted with its place, as far as the names of operations reveal it. The device is stricter than a
+real card with indices on the CPU. It does not show properties of a real card such as other kernels, other orders of
+sums and memory.
 
-The device belongs to the process that imports this module, so tests do it in one of its own (`card_cases`).
+The device belongs to the process that imports this module, so tests use it in a separate process (`card_cases`).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from directshape_torch.numerics import gradient_mode
 
 
 class _Module(backend_registration._DummyBackendModule):
-    """`torch.card`: what PyTorch asks of any device."""
+    """A `_Module` is `torch.card`, with the functions that PyTorch calls on any device."""
 
     def get_amp_supported_dtype(self) -> list[torch.dtype]:
         return [torch.float16]
@@ -64,7 +64,7 @@ INDEXED = {"aten.index", "aten.index_put", "aten.index_put_", "aten._index_put_i
 
 
 class Wait(NamedTuple):
-    """One wait of the host."""
+    """A `Wait` is one wait of the host."""
 
     operation: str
     functions: tuple[str, ...]  # of the package, from the one that asked outwards
@@ -75,7 +75,7 @@ _waits: list[Wait] = []
 
 @contextmanager
 def noted_waits() -> Iterator[list[Wait]]:
-    """Those inside, in order."""
+    """The waits in the body, in order."""
     _waits.clear()
     found: list[Wait] = []
     try:
@@ -95,7 +95,7 @@ def _note(operation: str) -> None:
 
 
 class CardTensor(torch.Tensor):
-    """A tensor that says it is on the card."""
+    """A `CardTensor` is a tensor that claims to be on the card."""
 
     held: Tensor
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
@@ -133,7 +133,7 @@ class CardTensor(torch.Tensor):
 
 
 def _run(func: Any, *args: Any, **kwargs: Any) -> Any:
-    """An operation with at least one tensor of the card, or that makes one."""
+    """Run an operation that has a tensor of the card, or makes one."""
     name = str(func.overloadpacket)
     tensors = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, Tensor)]
     on_card = [x for x in tensors if isinstance(x, CardTensor)]
@@ -161,7 +161,7 @@ def _run(func: Any, *args: Any, **kwargs: Any) -> Any:
 
 
 def _may_mix(func: Any, args: tuple[Any, ...], elsewhere: list[Tensor]) -> bool:
-    """Whether an operation with a tensor of the card takes these tensors of the processor."""
+    """Whether an operation with a tensor of the card accepts these tensors of the CPU."""
     name = str(func.overloadpacket)
     if name == "aten.copy_" or not elsewhere:
         return True
@@ -201,7 +201,7 @@ for _name in ("arange", "arange.start", "arange.start_step", "eye", "eye.m"):
 
 
 class _NumbersOfTheHost(TorchFunctionMode):
-    """`torch.tensor` and its like, which go around everything else: numbers of the host that are sent over."""
+    """A `_NumbersOfTheHost` intercepts `torch.tensor` and similar functions, which copy numbers from the host."""
 
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
@@ -219,7 +219,7 @@ _constants: dict[Any, Any] = {}
 
 
 def _kept(constants: Any, values: Any, like: Tensor, make: Callable[[torch.dtype, torch.device], Any]) -> Any:
-    """As `numerics.tensors` keeps constants of plain tensors, which those of a real card are."""
+    """The constants of the card, kept as `numerics.tensors` keeps those of plain tensors."""
     key = (id(constants), values, like.dtype, like.device)
     if key not in _constants:
         _constants[key] = make(like.dtype, like.device)
@@ -227,15 +227,15 @@ def _kept(constants: Any, values: Any, like: Tensor, make: Callable[[torch.dtype
 
 
 def _is_plain(tensor: Tensor) -> bool:
-    """As `gradient_mode` says it of plain tensors."""
+    """Whether a tensor counts as plain in `gradient_mode`, as those of a real card do."""
     return type(tensor) is CardTensor or gradient_mode.is_plain(tensor)
 
 
 @contextmanager
 def pretended_card() -> Iterator[torch.device]:
-    """Region in which the device can be used.
+    """Make the device available in the body.
 
-    The package takes subclasses of tensors for what a tracer has made, and keeps nothing of them; here it must.
+    The package treats subclasses of tensors as made by a tracer and keeps none of them, but here it must keep them.
     """
     replaced = {"_kept": _kept, "is_plain": _is_plain}
     of_package = [

@@ -1,4 +1,4 @@
-"""One small shape prior of every kind, float64."""
+"""This module has one small shape prior of every kind, float64."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ KINDS = ("pca", "neural")
 
 @lru_cache
 def prior_of(kind: str) -> ShapePrior:
-    """The prior of a kind; nobody changes its tensors."""
+    """The prior of a kind; its tensors must not be changed."""
     prior = ellipsoid_prior() if kind == "pca" else NeuralShapePrior.load_bundled()
     return prior.double()
 

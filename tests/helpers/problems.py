@@ -1,4 +1,4 @@
-"""Refinement problems over the synthetic street, for the settings that change the mathematics."""
+"""This module has refinement problems over the synthetic street, for settings that change the mathematics."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def begun_stage(
 
 
 def figures_at(stage: CarStage, state: CarState) -> Figures:
-    """The energy at a state, every ray of which is marched."""
+    """The energy at a state, with all rays marched."""
     return stage.figures(stage.problem.look(state))
 
 
@@ -69,7 +69,7 @@ def photometric_of(stage: CarStage) -> Photometric:
 
 
 def left_of(stage: CarStage) -> LeftPixels:
-    """The left pixels of which the photometric term of a stage is made."""
+    """The left pixels of the photometric term of a stage."""
     return next(each.left for each in stage.problem.evidence if isinstance(each, PhotometricEvidence))
 
 

@@ -1,4 +1,4 @@
-"""Problems with known minima for the solver: linear least squares, and ones that go wrong on purpose."""
+"""This module has problems with known minima for the solver: linear least squares, and problems with faults."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from directshape_torch.solver.sharing import INDEPENDENT, Sharing
 
 
 class Vector(NamedTuple):
-    """State of B problems: a point each."""
+    """A `Vector` is the state of B problems, one point for each."""
 
     x: Tensor  # (B, D)
 
 
 class Energy(NamedTuple):
-    """Cost, gradient and Gauss-Newton matrix of B problems, and the point where they were evaluated."""
+    """An `Energy` has cost, gradient and Gauss-Newton matrix of B problems, and the evaluated points."""
 
     cost: Tensor  # (B,)
     gradient: Tensor  # (B, D)
@@ -29,9 +29,9 @@ class Energy(NamedTuple):
 
 
 class VectorProblem:
-    """B problems over points whose stages fix nothing: a `Problem`, its stages and its iterations in one.
+    """A `VectorProblem` is B problems over points whose stages fix nothing, with stages and iterations in one class.
 
-    A subclass says what the energy is and which problems are left when some have ended.
+    A subclass defines the energy and the subset of problems that are left.
     """
 
     def __init__(self, stages: Sequence[StageConfig], num_unknowns: int, limit: float = 1e6) -> None:
@@ -40,11 +40,11 @@ class VectorProblem:
         self.sharing: Sharing = INDEPENDENT
 
     def energy(self, x: Tensor) -> Energy:
-        """At points (B, D)."""
+        """The energy at points (B, D)."""
         raise NotImplementedError
 
     def part(self, index: Tensor) -> Self:
-        """Some of the problems (Q,)."""
+        """The problems of the given rows (Q,)."""
         raise NotImplementedError
 
     def stages(self) -> list[StageConfig]:
@@ -81,10 +81,10 @@ class VectorProblem:
 
 
 class ResidualProblem(VectorProblem):
-    """Minimises `sum_i r_i(x)^2 / 2` of a residual given per problem, with the Jacobian by autograd.
+    """A `ResidualProblem` minimises `sum_i r_i(x)^2 / 2` of a residual for each problem, with autograd Jacobians.
 
-    It keeps the points at which the iterations evaluated it, the points that each was said to be near, and how many
-    problems were left whenever some had ended.
+    It records the points of evaluation, the near points that it was given, and the number of problems left whenever
+    some had ended.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class ResidualProblem(VectorProblem):
 def linear_problem(
     num_problems: int, num_unknowns: int, stages: Sequence[StageConfig]
 ) -> tuple[ResidualProblem, Tensor]:
-    """`r = A_i x - b_i` with its least-squares solution (B, D)."""
+    """A problem `r = A_i x - b_i` with its least-squares solution (B, D)."""
     generator = torch.Generator().manual_seed(12)
     A = torch.randn(num_problems, 2 * num_unknowns, num_unknowns, generator=generator, dtype=torch.float64)
     b = torch.randn(num_problems, 2 * num_unknowns, generator=generator, dtype=torch.float64)

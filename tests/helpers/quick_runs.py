@@ -1,4 +1,4 @@
-"""Runs over the data set of `helpers.kitti_folder`, a few iterations a car."""
+"""This module makes runs over the data set of `helpers.kitti_folder` with few iterations for each car."""
 
 from __future__ import annotations
 
@@ -33,6 +33,6 @@ def refine(
     fresh: bool = False,
     **options: Any,
 ) -> RunSummary:
-    """By a refiner of one's own, or a quick one."""
+    """Refine the data set with the given refiner, or with a quick one."""
     made = made or refiner(root, config)
     return refine_dataset(dataset(root), made, out, RefineOptions(**options), observer, fresh=fresh)

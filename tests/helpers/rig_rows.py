@@ -1,4 +1,4 @@
-"""Reduced observations of detections behind a rig with a known field, and the rig itself."""
+"""This module has reduced observations of detections behind a rig with a known field, and the rig itself."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FIELD = torch.tensor([-0.3, 0.1, 0.2, -0.3, 0.1, 0.2, -0.1, 0.1, 0.0, -0.4], dty
 
 
 def estimate(rows: Tensor | None = None, size_wh: tuple[int, int] = SIZE_WH, focal_px: float = 721.0) -> RigEstimate:
-    """Of a rig like KITTI's, with these rows."""
+    """The estimate of a rig like KITTI's with these rows."""
     K = torch.tensor([[focal_px, 0, 620], [0, focal_px, 172], [0, 0, 1]], dtype=torch.float64)
     T_right_cam = torch.eye(4, dtype=torch.float64)
     T_right_cam[0, 3] = -0.54
@@ -33,7 +33,7 @@ def rows_of_cars(
     field: Tensor = FIELD,
     u_range: tuple[float, float] = (60.0, 1180.0),
 ) -> Tensor:  # (N, 8)
-    """Cars 7 to 50 m ahead on a road, one in twelve of them matched to something else."""
+    """Rows of cars 7 to 50 m ahead on a road, one in twelve with a wrong match."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(low: float, high: float) -> Tensor:

@@ -1,4 +1,4 @@
-"""Fixtures of runs over a data set; `tests/conftest.py` makes them known."""
+"""This module has fixtures of runs over a data set; `tests/conftest.py` imports them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from helpers.kitti_folder import write_data_set
 
 @pytest.fixture(scope="session")
 def shared_kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data set in KITTI's folders that no test writes to."""
+    """A data set in KITTI's folders that no test changes."""
     root = tmp_path_factory.mktemp("kitti")
     write_data_set(root)
     return root
@@ -21,7 +21,7 @@ def shared_kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same with frames 000000 and 000001 alone."""
+    """The data set with only the frames 000000 and 000001."""
     root = tmp_path_factory.mktemp("kitti")
     write_data_set(root, ("000000", "000001"))
     return root
@@ -29,11 +29,11 @@ def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def kitti_copy(shared_kitti: Path, tmp_path: Path) -> Path:
-    """A copy of it that a test may damage."""
+    """A copy of the data set that a test may damage."""
     return Path(shutil.copytree(shared_kitti, tmp_path / "kitti"))
 
 
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
-    """A finished run with meshes, which reports and exports read and no test writes to."""
+    """A finished run with meshes for reports and exports that no test changes."""
     return finished_run(tmp_path_factory.mktemp("finished"), meshes="glb")

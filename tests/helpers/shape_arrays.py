@@ -1,4 +1,4 @@
-"""The refined cars of a frame as they are written, with arbitrary numbers."""
+"""This module makes the refined cars of a frame in their file format, with arbitrary numbers."""
 
 from __future__ import annotations
 

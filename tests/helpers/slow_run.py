@@ -1,4 +1,4 @@
-"""A run by two slow workers, for a test that kills it: slow_run.py ROOT OUT."""
+"""This program runs two slow workers for a test that kills it: slow_run.py ROOT OUT."""
 
 from __future__ import annotations
 

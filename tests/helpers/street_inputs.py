@@ -1,4 +1,4 @@
-"""A rendered street as a function of one number that enters wherever the refiner takes a gradient."""
+"""This module makes a rendered street a function of one number that enters every differentiable input."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SETTLED = replace(
 
 
 class StreetInputs:
-    """Everything that can be differentiated by, moved along one seeded direction each by a scalar."""
+    """A `StreetInputs` has all differentiable inputs, each moved along a seeded direction by a scalar."""
 
     def __init__(self) -> None:
         self.prior, self.scene = cached_street()

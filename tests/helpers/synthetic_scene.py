@@ -1,4 +1,4 @@
-"""A tiny stereo street with exact truth: textured shapes over a textured ground, ray cast in both images."""
+"""This module renders a tiny stereo street with exact truth: textured shapes over a textured ground, ray cast."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BACKDROP_M = 150.0
 
 @dataclass(frozen=True)
 class Street:
-    """Frames, perfect detections and the truth they were rendered from."""
+    """A `Street` has frames, perfect detections and the truth from which they were rendered."""
 
     frames: FrameBatch
     detections: Detections
@@ -33,7 +33,7 @@ class Street:
 
 
 def stereo_camera(width: int, height: int, focal_px: float, dtype: torch.dtype = torch.float64) -> StereoCamera:
-    """A rig of the size of KITTI's baseline whose right camera is also a little lower and further back."""
+    """A rig with KITTI's baseline whose right camera is also a little lower and further back."""
     K = torch.tensor([[focal_px, 0, width / 2 - 3], [0, focal_px, height / 2 - 10], [0, 0, 1]], dtype=dtype)[None]
     T_right_cam = torch.eye(4, dtype=dtype)[None].clone()
     T_right_cam[0, :3, 3] = torch.tensor([-0.53, -0.003, 0.004], dtype=dtype)
@@ -78,7 +78,7 @@ def street(
     focal_px: float = 150.0,
     T_right_cam: Tensor | None = None,
 ) -> Street:
-    """One frame with the given cars; everything in the dtype of the prior."""
+    """One frame with the given cars, in the dtype of the prior."""
     dtype, count = prior.origin.dtype, len(location_cam)
     code = prior.initial_code(count) if code is None else code
     width, height = size_wh
@@ -139,7 +139,7 @@ def disturbed(detections: Detections, metres: float = 0.15, radians: float = 0.0
 
 
 def masked(detections: Detections, left: Tensor | None = None, right: Tensor | None = None) -> Detections:
-    """The detections with masks only where a condition (B,) holds."""
+    """The detections with masks only where a condition (B,) is true."""
     masks_left, masks_right = detections.mask_left, detections.mask_right
     return replace(
         detections,
@@ -149,7 +149,7 @@ def masked(detections: Detections, left: Tensor | None = None, right: Tensor | N
 
 
 def select(detections: Detections, rows: Tensor) -> Detections:
-    """Some of the detections, in the given order."""
+    """The detections of the given rows, in their order."""
     return select_detections(detections, rows)
 
 
@@ -166,7 +166,7 @@ def joined_frames(parts: list[FrameBatch]) -> FrameBatch:
 
 
 def joined_detections(parts: list[Detections], size_hw: tuple[int, int]) -> Detections:
-    """Detections of consecutive single-frame batches, numbered by frame, masks padded to one size."""
+    """Detections of consecutive single-frame batches, numbered by frame, with masks padded to one size."""
 
     def padded(number: int, part: Detections) -> Detections:
         masks = {name: getattr(part, name).padded(size_hw) for name in ("mask_left", "mask_right")}
@@ -177,7 +177,7 @@ def joined_detections(parts: list[Detections], size_hw: tuple[int, int]) -> Dete
 
 @lru_cache(maxsize=4)
 def cached_street(dtype: torch.dtype = torch.float64) -> tuple[PCAShapePrior, Street]:
-    """The two-car street, rendered once a test session; nobody changes its tensors."""
+    """The two-car street, rendered once for all tests; its tensors must not be changed."""
     from helpers.ellipsoids import ellipsoid_prior
 
     prior = ellipsoid_prior(dtype)
@@ -186,6 +186,6 @@ def cached_street(dtype: torch.dtype = torch.float64) -> tuple[PCAShapePrior, St
 
 @lru_cache(maxsize=2)
 def measured_street(dtype: torch.dtype = torch.float64) -> tuple[PCAShapePrior, Street]:
-    """The two-car street whose frames bring their exact disparity."""
+    """The two-car street with frames that have their exact disparity."""
     prior, scene = cached_street(dtype)
     return prior, replace(scene, frames=replace(scene.frames, disparity=scene.disparity))

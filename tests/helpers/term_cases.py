@@ -1,4 +1,4 @@
-"""States in which the terms are examined: typical, near, far, at the image's border, with a turned right camera."""
+"""This module has states for checks of terms: typical, near, far, at the border, with a rotated right camera."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ REGIMES = ("typical", "three_sigma", "near", "far", "border", "rotated_right_cam
 
 @lru_cache
 def scene_of(regime: str) -> Street:
-    """Rendered once a test session."""
+    """A scene, rendered once for all tests."""
     prior = ellipsoid_prior()
     if regime == "near":
         return street(prior, [(0.4, 1.65, 4.6)], [0.9], focal_px=90.0)
@@ -40,7 +40,7 @@ def scene_of(regime: str) -> Street:
 
 
 def case(regime: str = "typical", config: str = "default", stage: int = 1) -> tuple[CarStage, CarState]:
-    """A stage begun at disturbed cars, and a state some way from there, tilted and of a shape of its own."""
+    """A stage begun at disturbed cars, and another state, tilted and with another shape."""
     scene = measured_street()[1] if config == "combined" else scene_of(regime)
     metres = 0.02 if regime == "far" else 0.08
     begun, state = begun_stage(

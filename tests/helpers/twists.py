@@ -1,4 +1,4 @@
-"""Twists from the regimes where formulas of SE(3) differ."""
+"""This module has twists from the regimes where formulas of SE(3) differ."""
 
 from __future__ import annotations
 

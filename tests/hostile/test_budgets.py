@@ -1,4 +1,4 @@
-"""Files of some bytes that ask for gigabytes, never end, or hold numbers that native code cannot take."""
+"""Small files that need gigabytes, never end, or have numbers that native code cannot use are refused."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_segmentations(segmentation: Any) -> None:
 
 
 def png(width: int, height: int) -> bytes:
-    """Black, of any size, in a few kilobytes."""
+    """A black image of any size, in a few kilobytes."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

@@ -1,4 +1,4 @@
-"""Meshes that ask for gigabytes in some bytes, or for other files."""
+"""Meshes that need gigabytes for a small file, or name other files, are refused."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ INDICES = {"bufferView": 1, "componentType": 5125, "count": 12, "type": "SCALAR"
 
 
 def glb(**changes: Any) -> bytes:
-    """A tetrahedron, with other parts."""
+    """A tetrahedron with the given other parts."""
     header = {
         "asset": {"version": "2.0"},
         "scene": 0,

@@ -1,4 +1,4 @@
-"""Names of frames are names: whatever they hold, nothing is written or overwritten outside of the output folder."""
+"""Frame names with any content cannot write or replace files outside the output folder."""
 
 from __future__ import annotations
 

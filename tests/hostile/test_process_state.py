@@ -1,4 +1,4 @@
-"""What belongs to the whole process is afterwards as it was before, whatever was called, also when it failed."""
+"""The state of the process is the same before and after every call, also after a failure."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def tensors(_: Path, __: Path) -> None:
 
 
 def commands(root: Path, out: Path) -> None:
-    """What a run leaves, seen by all others."""
+    """Run a refinement and then the commands that read its folder."""
     run(root, out)
     data, labels, results = data_options(root), str(root / "training" / "label_2"), str(out / "out" / "data")
     with_prior = [*data, "--prior", str(root / "prior.safetensors")]

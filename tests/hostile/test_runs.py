@@ -1,4 +1,4 @@
-"""Runs that are disturbed from outside end, and account for every frame by its files or by their exit code."""
+"""Runs that are disturbed from outside end, and every frame has its files or a reported failure."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_workers_that_are_killed_as_they_start(shared_kitti: Path, tmp_path: Pat
 
 
 class Mover(RunObserver):
-    """Renames the output folder once a frame has ended."""
+    """A `Mover` renames the output folder after a frame has ended."""
 
     def __init__(self, out: Path, to: Path) -> None:
         self.out, self.to = out, to
@@ -83,7 +83,7 @@ def test_a_folder_that_is_moved_away_is_not_success(shared_kitti: Path, tmp_path
 
 
 class Thief(RunObserver):
-    """Removes a file of each frame that has ended."""
+    """A `Thief` removes a file of each frame that has ended."""
 
     def __init__(self, out: Path) -> None:
         self.out = out

@@ -1,4 +1,4 @@
-"""Grey levels, gradients of whole frames, parts and pixels, and pyramids: by hand, OpenCV and kornia."""
+"""Grey levels, gradients of frames, parts and pixels, and pyramids agree with numbers by hand, OpenCV and kornia."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def by_kornia(
     image: Tensor,  # (3, H, W)
     size_hw: tuple[int, int],
 ) -> Tensor:
-    """Of one frame without its padding, (height, width)."""
+    """Values of one frame without its padding, (height, width)."""
     height, width = size_hw
     grey = grey_levels(image[None, :, :height, :width])
     return length_2d(*spatial_gradient(grey[None], mode="diff")[0, 0])

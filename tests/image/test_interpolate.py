@@ -1,4 +1,4 @@
-"""Bilinear lookup: by hand, an independent reference, autograd, borders, padding, images of many sizes in a row."""
+"""Bilinear lookups agree with numbers by hand, a reference and autograd, at borders, in padding, in mixed sizes."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def _images() -> list[Tensor]:
 
 
 def _together(images: list[Tensor], u: Tensor, v: Tensor) -> BilinearPatch:
-    """Row i of the coordinates in image i, the images behind one another without padding."""
+    """A lookup of row i of the coordinates in image i, with the images stored one after another without padding."""
     pixels = torch.cat([image.flatten() for image in images])
     first = torch.tensor([0, *(image.numel() for image in images[:-1])]).cumsum(0)
     height, width = torch.tensor([image.shape for image in images]).unbind(1)

@@ -1,4 +1,4 @@
-"""What is said about files of the plain folder layout that are not as they should be."""
+"""Wrong files of the plain folder layout give messages that name the mistake."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FRAME: dict[str, Any] = {"schema_version": 1, "objects": [CAR, {"class": "Person
 
 
 def changed(content: dict[str, Any], path: str, value: object) -> dict[str, Any]:
-    """A copy with one entry replaced, or removed where the value is `...`."""
+    """A copy with one entry replaced, or removed if the value is `...`."""
     content = copy.deepcopy(content)
     *parents, last = [int(word) if word.isdecimal() else word for word in path.split(".")]
     at: Any = content

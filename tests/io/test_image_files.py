@@ -1,4 +1,4 @@
-"""Damaged images are refused whatever the decoder would make of them; disparity maps come back as they were written."""
+"""Damaged images are refused even if the decoder accepts them, and disparity maps are read as they were written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Calibration and plane files: layouts, hand-derived offsets, signs, and complaints that name the line."""
+"""These tests check calibration and plane files: layouts, hand-derived offsets, signs, errors that name the line."""
 
 from __future__ import annotations
 

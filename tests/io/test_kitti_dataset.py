@@ -1,4 +1,4 @@
-"""A tiny data set in KITTI's layout: what is loaded, from where, and what is said about damaged files."""
+"""A tiny data set in KITTI's layout is loaded, and damaged files are named."""
 
 from __future__ import annotations
 

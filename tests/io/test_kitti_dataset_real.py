@@ -1,4 +1,4 @@
-"""Real and rendered frames; skipped unless DIRECTSHAPE_DATA names the folder of the data."""
+"""Real and rendered frames are loaded; the tests are skipped unless DIRECTSHAPE_DATA names their folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Label and result lines, and what is said of bad ones."""
+"""Label and result lines are read, and wrong ones are named."""
 
 from __future__ import annotations
 

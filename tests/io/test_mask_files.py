@@ -1,4 +1,4 @@
-"""Every form of mask file gives the same instances; damaged ones are named."""
+"""Every form of mask file gives the same instances, and damaged files are named."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One-to-one matching by pixels, in the left and through the camera in the right image."""
+"""Masks are matched one to one by pixels in the left image, and through the camera in the right image."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def camera(right_cx: float = 300.0) -> StereoCamera:
 def car(
     line: int, x: float, z: float, box_2d: Box | None = NO_BOX, score: float = 0.9, kind: str = "Car"
 ) -> KittiObject:
-    """A car across the view at a place on the ground; without a 2D box of its own (None) that of its projection."""
+    """A car across the view at a place on the ground; its 2D box is the given one, or for None its projection."""
     if box_2d is None:
         box_2d = projected(x, z)[0]
     numbers = " ".join(map(str, box_2d))

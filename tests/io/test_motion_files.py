@@ -1,4 +1,4 @@
-"""Times of frames and poses of the camera: from the files of a sequence to the tensors of a call."""
+"""Times of frames and poses of the camera get from the files of a sequence into the tensors of a call."""
 
 from __future__ import annotations
 

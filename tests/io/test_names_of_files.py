@@ -1,4 +1,4 @@
-"""Whole data sets whose files are called, and whose texts are written, as other systems do."""
+"""Data sets with names and texts written by other systems are read."""
 
 from __future__ import annotations
 

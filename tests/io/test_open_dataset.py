@@ -47,7 +47,7 @@ def renamed(kitti: Path, to: Path, names: tuple[str, ...]) -> tuple[Path, Path]:
 
 
 def assert_same(dataset: StereoDataset, frame_id: str, expected: LoadedFrame) -> None:
-    """Also for a copy as other processes get it."""
+    """Assert equal tensors, also for a copy as other processes get it."""
     dataset = pickle.loads(pickle.dumps(dataset))
     loaded = dataset.load(frame_id)
     assert loaded.frame_id == frame_id

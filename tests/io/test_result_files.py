@@ -1,4 +1,4 @@
-"""Results read back as refined boxes; shapes come back and refuse what is no such file."""
+"""Results are read back as refined boxes, and shape files are read back or refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run resumes only into results of the same settings and contents, and says what differs."""
+"""A run resumes only into results of the same settings and contents, and names the difference."""
 
 from __future__ import annotations
 

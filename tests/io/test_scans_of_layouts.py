@@ -1,4 +1,4 @@
-"""The LiDAR scan of a frame in every layout that has one, at the same place of the camera."""
+"""The LiDAR scan of a frame has the same points in every layout that has one."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def check_scan(kitti: Path, layout: LayoutName, root: Path, frame_id: str, to: Path) -> None:
-    """Detections and scan of the frame under its name in the layout."""
+    """Write detections and scan of the frame under its name in the layout, and check the scan."""
     put(kitti / "detections" / "data" / f"{FRAME}.txt", to / "found" / f"{frame_id}.txt")
     put(kitti / "training" / "velodyne" / f"{FRAME}.bin", to / "scans" / f"{frame_id}.bin")
     dataset = open_dataset(layout, root, to / "found", lidar_dir=to / "scans")

@@ -1,6 +1,7 @@
-"""Small benches, built anew for each test so that a mutated function is seen; two codes keep them quick.
+"""This file builds small benches anew for each test, so that a mutated function is seen; two codes keep them fast.
 
-Of two cars the second is the last too: three tell a car from its number counted backwards.
+Three cars are used, because with two cars the second one is also the last, so that an index counted backwards would not
+be noticed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Right Jacobians pass, wrong ones do not, and what is left out is counted."""
+"""Right Jacobians pass, wrong ones do not, and excluded entries are counted."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ X = torch.linspace(-1.3, 1.7, 12, dtype=torch.float64)[:, None]
 def compared(
     function: Callable[[Tensor], Tensor], analytic: Tensor, autograd: Tensor | None = None
 ) -> list[Comparison]:
-    """A function of one number at each of `X`; autograd's derivative is right unless another is given."""
+    """The comparison of a function of a number at each of `X`; autograd's derivative is right unless one is given."""
     if autograd is None:
         _, autograd = torch.func.jvp(function, (X,), (torch.ones_like(X),))
     experiment = Experiment((Subject("f", analytic, autograd),), lambda d: [function(X + d)[:, 0]], X.new_ones(1))

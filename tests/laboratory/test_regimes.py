@@ -1,4 +1,4 @@
-"""The regimes draw what their names say, and the same every time."""
+"""The regimes draw what their names say, and the same states every time."""
 
 from __future__ import annotations
 

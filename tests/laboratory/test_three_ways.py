@@ -1,4 +1,4 @@
-"""The bounds hold on a small draw, for every term; `mutate_jacobians.py` says that wrong ones break them."""
+"""The bounds hold on a small draw for every term; `mutate_jacobians.py` shows that wrong terms break them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _EMPTY = "grid_border", "photometric"
 
 
 def _differenced(regime: str) -> tuple[str, ...]:
-    """In the dear state of a track only those that are nowhere else."""
+    """The terms to compare numerically; for the expensive state of a track only those that exist nowhere else."""
     return TRACK_NAMES if regime == "track" else (*TERM_NAMES, *_MORE.get(regime, ()))
 
 

@@ -1,4 +1,4 @@
-"""Occlusion: order, hidden pixels, crops, against hand-made scenes and a slow reference."""
+"""Occlusion (order, hidden pixels, crops) agrees with hand-made scenes and a slow reference."""
 
 from __future__ import annotations
 
@@ -54,14 +54,14 @@ def all_pixels(count: int) -> tuple[Tensor, Tensor]:
 
 
 def hidden_pixels(detections: Detections, side: Side, object_index: Tensor, uv: Tensor) -> Tensor:
-    """Whether pixels (P, 2) of objects (P,) are hidden; the reference finds the same."""
+    """Whether pixels (P, 2) of objects (P,) are hidden, after a check that the reference agrees."""
     hidden = occlusion_map(detections, side).at(object_index, uv)
     assert torch.equal(hidden, one_by_one(detections, side, object_index, uv))
     return hidden
 
 
 def instances_in_front(detections: Detections, side: Side, order: OcclusionOrder = "depth") -> Tensor:
-    """Which instance hides which detection (B + M, B), by a pixel that each of them covers alone."""
+    """Which instance hides which detection (B + M, B), from masks in which each covers a pixel of its own."""
     others, count = detections.occluders, len(detections)
     num_instances = count + (0 if others is None else len(others.frame_index))
     masks = squares(*((i, 0, i + 1, 1) for i in range(num_instances)))

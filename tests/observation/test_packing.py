@@ -1,4 +1,4 @@
-"""Packed pixels: the sparse form against the whole-frame one over random scenes, and how its work grows."""
+"""Packed pixels agree with a whole-frame form over random scenes, and their work grows with the cars only."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PADDING = 0.77  # grey that must not matter
 
 
 def whole_frame_side(frames: FrameBatch, d: Detections, side: Side, regions: Tensor, config: SamplingConfig) -> Any:
-    """Object, pixel, foreground and gradient of the chosen pixels of one image: every pixel of every frame is read."""
+    """Object, pixel, foreground and gradient of the chosen pixels of one image, by reading all pixels."""
     images, masks = (
         (frames.images_left, d.mask_left.dense()) if side == "left" else (frames.images_right, d.mask_right.dense())
     )  # fmt: skip
@@ -39,7 +39,7 @@ def whole_frame_side(frames: FrameBatch, d: Detections, side: Side, regions: Ten
 
 
 def random_masks(generator: torch.Generator, frame: Tensor, sizes: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Rectangles of random probabilities with holes, often over a border; some stay empty."""
+    """Rectangles of random probabilities with holes, often over a border, some empty."""
     masks = torch.zeros(len(frame), *shape)
     for mask, (height, width) in zip(masks, sizes[frame].tolist(), strict=True):
         u, v = (int(torch.randint(-20, n, (1,), generator=generator)) for n in (width, height))
@@ -50,7 +50,7 @@ def random_masks(generator: torch.Generator, frame: Tensor, sizes: Tensor, shape
 
 
 def random_scene(seed: int, count: int, num_frames: int = 3, others: int = 4) -> tuple[FrameBatch, Detections]:
-    """Frames of different sizes, padded, and cars anywhere in them."""
+    """Frames of different sizes, padded, with cars at random places."""
     generator = torch.Generator().manual_seed(seed)
     sizes = torch.stack([torch.randint(40, n, (num_frames,), generator=generator) for n in (110, 190)], dim=1)
     shape = tuple(sizes.amax(dim=0).tolist()) if num_frames else (50, 60)
@@ -161,7 +161,7 @@ def test_gradients_reach_images_and_masks() -> None:
 
 
 class TouchedElements(TorchDispatchMode):
-    """Counts what every operation reads and writes; lookups touch what they bring back, not what they search in."""
+    """A `TouchedElements` counts the elements that operations read and write; lookups count what they return."""
 
     LOOKUPS = ("index_select", "index.Tensor", "gather")
 
@@ -180,7 +180,7 @@ class TouchedElements(TorchDispatchMode):
 
 
 def enlarged(frames: FrameBatch, d: Detections, factor: int) -> tuple[FrameBatch, Detections]:
-    """The same cars in a frame that has more to see below and to the right of them."""
+    """The same cars in a frame that is larger below and to the right of them."""
     height, width = frames.images_left.shape[2:]
     more = (0, (factor - 1) * width, 0, (factor - 1) * height)
     images = {
@@ -193,7 +193,7 @@ def enlarged(frames: FrameBatch, d: Detections, factor: int) -> tuple[FrameBatch
 
 
 def touched_by_packing(frames: FrameBatch, d: Detections) -> int:
-    """Elements touched by all but finding the masks' extents."""
+    """Number of elements that packing touches, except for the search of the masks' extents."""
     _ = d.mask_left.areas, d.mask_right.areas
     with TouchedElements() as packing:
         pack_pixels(frames, d, SamplingConfig())

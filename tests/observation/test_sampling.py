@@ -1,4 +1,4 @@
-"""Which pixels of a region are sampled: hand-made cases, properties, and the plain form of the reference."""
+"""The sampled pixels of a region agree with hand-made cases, properties, and the plain form of the reference."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MODES: tuple[SamplingMode, ...] = get_args(SamplingMode)
 
 
 def noise(seed: int) -> Tensor:
-    """Two padded frames."""
+    """Two padded frames of noise."""
     return torch.rand(2, 3, 70, 150, generator=torch.Generator().manual_seed(seed))
 
 

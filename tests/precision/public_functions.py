@@ -1,4 +1,4 @@
-"""Every public function of tensors with arguments for it, by the name under which it is found in the package."""
+"""This module has arguments for every public function of tensors, by its name in the package."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ MODULES = (
 
 @dataclass(frozen=True)
 class Numbers:
-    """Tensors of one dtype in which no product is exact in fewer digits than float32 has."""
+    """A `Numbers` has tensors of one dtype in which no product is exact in fewer digits than float32 has."""
 
     uv: Tensor  # (20, 2) pixels
     depth: Tensor  # (20,) metres
@@ -74,7 +74,7 @@ class Numbers:
 
 @cache
 def numbers() -> Numbers:
-    """Of float32."""
+    """Numbers of float32."""
     chance = torch.Generator().manual_seed(0)
 
     def between(low: float, high: float, *shape: int) -> Tensor:
@@ -187,7 +187,7 @@ Prior = PCAShapePrior | NeuralShapePrior
 
 
 def of_prior(name: str, shape: str, make: Callable[[], Prior]) -> dict[str, Case]:
-    """What each family of shapes offers."""
+    """The public functions of a family of shapes."""
     return {
         f"{name}.values": lambda n: make().values(n.code),
         f"{name}.dimensions_and_derivative": lambda n: make().dimensions_and_derivative(n.code),
@@ -375,7 +375,7 @@ WITHOUT_NUMBERS = {
 
 
 def public_names() -> set[str]:
-    """Functions, and methods and properties of classes, that the package exports or that its modules here hold."""
+    """Functions, and methods and properties of classes, that the package exports or these modules contain."""
     inside = importlib.import_module("directshape_torch.geometry")
     geometry = [each.name for each in pkgutil.iter_modules(inside.__path__, f"{inside.__name__}.")]
     modules = [importlib.import_module(name) for name in (*geometry, *MODULES)]
@@ -389,7 +389,7 @@ def _is_of(module: ModuleType, value: object) -> bool:
 
 
 def _names_of(value: Any) -> Iterator[str]:
-    """The name of a function behind its module's, or of the members of a class behind its own."""
+    """The name of a function after its module's, or of the members of a class after its own."""
     if inspect.isfunction(value):
         yield f"{value.__module__.rpartition('.')[2]}.{value.__name__}"
     elif inspect.isclass(value) and not getattr(value, "_is_protocol", False) and not issubclass(value, Exception):

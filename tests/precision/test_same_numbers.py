@@ -17,7 +17,7 @@ HALF = (torch.bfloat16, torch.float16)
 
 
 def values(given: Any) -> Iterator[Any]:
-    """What can be compared in what a function gave."""
+    """The comparable values in the result of a function."""
     if isinstance(given, (Tensor, np.ndarray, str)):
         yield (
             given.detach() if isinstance(given, Tensor) else np.asarray(given) if not isinstance(given, str) else given

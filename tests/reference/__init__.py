@@ -1,1 +1,1 @@
-"""Every residual a second time, slow and readable, ray by ray: what the terms must agree with."""
+"""This package computes every residual a second time, slowly and readably, ray by ray, as reference for the terms."""

@@ -1,4 +1,4 @@
-"""Which pixels of a car nearer instances hide, one instance after the other."""
+"""This module finds the pixels of a car that nearer instances hide, one instance after the other."""
 
 from __future__ import annotations
 

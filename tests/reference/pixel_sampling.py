@@ -1,4 +1,4 @@
-"""The pixels of a car, cell by cell, from the gradients of whole frames."""
+"""This module samples the pixels of a car, cell by cell, from the gradients of whole frames."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def select_pixels(
     mode: SamplingMode,
     settings: SamplingConfig,
 ) -> tuple[Tensor, Tensor]:
-    """Object (P,) and uv (P, 2), cell by cell."""
+    """Object (P,) and uv (P, 2) of the sampled pixels, cell by cell."""
     chosen: list[tuple[int, int, int]] = []
     for number, ((u0, v0, u1, v1), side) in enumerate(
         zip(regions.tolist(), cell_sides(regions, settings)[:, 0].tolist(), strict=True)

@@ -1,4 +1,4 @@
-"""What rays meet of a shape, by fine samples narrowed down; nothing is shared with `directshape_torch.terms.depth`."""
+"""This module intersects rays and shapes by fine samples, without code of `directshape_torch.terms.depth`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _ROUNDS = 18
 
 
 class RaysObj(NamedTuple):
-    """P rays in the frames of their cars."""
+    """A `RaysObj` has P rays in the frames of their cars."""
 
     car: Tensor  # (P,)
     centre: Tensor  # (P, 3) metres
@@ -24,7 +24,7 @@ class RaysObj(NamedTuple):
 
     @classmethod
     def of(cls, T_obj_cam: Tensor, car: Tensor, centre_cam: Tensor, ray_cam: Tensor) -> RaysObj:
-        """From centres and rays (P, 3) in the camera frame, by the poses (B, 4, 4) of the cars."""
+        """Rays from centres and directions (P, 3) in the camera frame, by the poses (B, 4, 4) of the cars."""
         R, t = T_obj_cam[car, :3, :3], T_obj_cam[car, :3, 3]
         return cls(car, (R @ centre_cam[..., None])[..., 0] + t, (R @ ray_cam[..., None])[..., 0])
 
@@ -47,7 +47,7 @@ class RaysObj(NamedTuple):
 
 
 def least(distance: Callable[[Tensor], Tensor], near: Tensor, far: Tensor) -> Tensor:
-    """Depth (P,) at which a function of it is least between two depths (P,)."""
+    """Depth (P,) at which a function of depth is least between two depths (P,)."""
     share = torch.linspace(0, 1, _SAMPLES + 1, dtype=near.dtype)
     for _ in range(_ROUNDS):
         depths = near[:, None] + (far - near)[:, None] * share
@@ -58,7 +58,7 @@ def least(distance: Callable[[Tensor], Tensor], near: Tensor, far: Tensor) -> Te
 
 
 def entry(distance: Callable[[Tensor], Tensor], near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
-    """Depth (P,) at which a function of it first falls below zero, and whether it does."""
+    """Depth (P,) at which a function of depth first falls below zero, and whether it does."""
     share = torch.linspace(0, 1, _SAMPLES + 1, dtype=near.dtype)
     deepest = least(distance, near, far)
     depths = torch.cat([near[:, None] + (far - near)[:, None] * share, deepest[:, None]], dim=1).sort(dim=1).values

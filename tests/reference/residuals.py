@@ -1,4 +1,4 @@
-"""The residuals of the paper as its formulas say them, from packed pixels and a state; float64."""
+"""This module computes the residuals of the paper by its formulas, from packed pixels and a state; float64."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def bilinear(image: Tensor, u: Tensor, v: Tensor) -> Tensor:
 def photometric(term: Photometric, pixels: LeftPixels, level: int, depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Plain residuals (M, R, 8) at depths (M, R), without any match of brightness: `I_r(warp(p~, d_p)) - I_l(p~)`.
 
-    Also the pixels (M, R, 8, 2) where the neighbours land in the right image, and their depth there.
+    Further results are the pixels (M, R, 8, 2) of the neighbours in the right image, and their depth there.
     """
     images, fixed = pixels.pyramid[level], term.pixel_set
     residual = torch.zeros(*depth.shape, 8, dtype=depth.dtype)

@@ -1,4 +1,4 @@
-"""Results that are not trusted: the input comes back, with its gradient, and no other car is touched."""
+"""For results that are not trusted the input is returned with its gradient, and other cars are unchanged."""
 
 from __future__ import annotations
 

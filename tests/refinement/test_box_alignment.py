@@ -1,4 +1,4 @@
-"""Boxes aligned in depth: box-shaped cars come back to where they were rendered, and nothing else of a box changes."""
+"""Boxes aligned in depth return to where box-shaped cars were rendered, and nothing else of a box changes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def aligned(frames: FrameBatch, detections: Detections) -> RefinementResult:
 
 
 def moved(detections: Detections, *factors: float) -> Detections:
-    """Cars whose depth, along the viewing rays of their origins, is multiplied."""
+    """Cars with multiplied depth along the viewing rays of their origins."""
     T_cam_obj = detections.T_cam_obj.clone()
     T_cam_obj[:, :3, 3] *= torch.tensor(factors, dtype=T_cam_obj.dtype)[:, None]
     return replace(detections, T_cam_obj=T_cam_obj)

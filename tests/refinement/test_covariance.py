@@ -1,4 +1,4 @@
-"""Covariance: the inverse Fisher information in the tangent of `retract`, and its image in (x, y, z, yaw)."""
+"""The covariance is the inverse Fisher information in the tangent of `retract`, and its image in (x, y, z, yaw)."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_what_is_not_known_of_the_field_widens_depth_alone() -> None:
 
 
 def refined_covariance(prior: PCAShapePrior, scene: Street, field: DisparityField) -> torch.Tensor:
-    """Uncalibrated covariance (B, 4, 4) of the street's cars, refined from where they are."""
+    """Uncalibrated covariance (B, 4, 4) of the street's cars, refined from their true poses."""
     frames = replace(scene.frames, camera=replace(scene.frames.camera, disparity_field=field))
     result = DirectShapeRefiner(prior, DEFAULT)(frames, scene.detections)
     J = quantities_jacobian(prior, CarState.of(se3.inverse(result.T_cam_obj), result.code))

@@ -1,4 +1,4 @@
-"""Disparity profiles: known disparities, the term itself, and curves drawn by hand."""
+"""Disparity profiles agree with known disparities, with the term itself, and with curves drawn by hand."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ OFFSETS = profile_offsets()
 
 @cache
 def far_street() -> Street:
-    """Two cars at 60 and 72 m before a very long lens: 19 and 16 px of disparity, 1 px over a whole car."""
+    """Two cars at 60 and 72 m in front of a very long lens: 19 and 16 px of disparity, 1 px over a whole car."""
     place = [(-2.0, CAMERA_HEIGHT_M, 60.0), (2.2, CAMERA_HEIGHT_M, 72.0)]
     return street(ellipsoid_prior(), place, [-1.4, 0.3], size_wh=(280, 200), focal_px=2200.0)
 

@@ -1,4 +1,4 @@
-"""Evidence that a car is there: halves of one surface agree, an error is small beside the contrast."""
+"""The evidence that a car is there is strong if halves of one surface agree and errors are below the contrast."""
 
 from __future__ import annotations
 

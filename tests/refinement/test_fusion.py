@@ -1,4 +1,4 @@
-"""Boxes of images and detector are brought together by what both are off by, and nothing else changes."""
+"""Boxes of images and detector are combined by the errors of both, and nothing else changes."""
 
 from __future__ import annotations
 

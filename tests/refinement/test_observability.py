@@ -1,4 +1,4 @@
-"""What a view does not show: on synthetic cars seen from known sides, and by hand."""
+"""The unseen directions of a view are found on synthetic cars seen from known sides, and by hand."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ LENGTH, DEPTH = (CAR_QUANTITIES.index(name) for name in ("length", "depth"))
 
 @cache
 def seen(rotation_y: float, **priors: float) -> Observability:
-    """What a car at 9 m, straight ahead, leaves unseen, at the truth."""
+    """The unseen directions of a car at 9 m, straight ahead, at the truth."""
     prior = ellipsoid_prior()
     scene = street(prior, [(0.0, CAMERA_HEIGHT_M, 9.0)], [rotation_y])
     config = replace(DEFAULT, priors=replace(DEFAULT.priors, **priors))

@@ -1,4 +1,4 @@
-"""Agreement with the images pixel by pixel, and the costs of a car that the solver gave its input back."""
+"""These tests check the agreement with the images pixel by pixel, and costs of cars that keep their input."""
 
 from __future__ import annotations
 

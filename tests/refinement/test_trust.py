@@ -1,4 +1,4 @@
-"""Probabilities: against sampled overlaps of boxes, by hand, from file, and at the borders."""
+"""Probabilities agree with sampled IoUs of boxes, with numbers by hand and with a file, also at the borders."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_probabilities_are_those_of_sampled_overlaps(turned: float) -> None:
     )
 
     def boxes(of: Tensor) -> Tensor:
-        """KITTI boxes straight ahead: depth is z, sideways x, and a heading of 0 lies across the ray."""
+        """KITTI boxes straight ahead; depth is z, sideways x, and a heading of 0 is across the ray."""
         depth, side, _, heading, length, width, height = of.unbind(dim=1)
         heading = heading / HEADING_LEVER_M + turned + math.pi / 2
         # A turn to the right lowers the angle that `turned` is counted in.

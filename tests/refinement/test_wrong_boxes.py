@@ -1,4 +1,4 @@
-"""Boxes of the bundled frame that are wrong by factors, with masks that are right."""
+"""Boxes of the bundled frame that are wrong by factors are recognised, with masks that are right."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page of a run as a file: what it carries, what it lacks and says so, and that names stay names."""
+"""The file of a page has its data, says what is missing, and shows names as text."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parts of the page: nothing from outside, nothing that runs but what is named, names that stay names, meshes."""
+"""The page loads nothing, runs only its own scripts, shows names as text and packs meshes without loss."""
 
 from __future__ import annotations
 

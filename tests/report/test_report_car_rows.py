@@ -1,4 +1,4 @@
-"""Rows of the table, errors to labels, and which frames get pictures."""
+"""These tests check rows of the table, errors to labels, and the choice of frames with pictures."""
 
 from __future__ import annotations
 

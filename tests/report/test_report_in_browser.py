@@ -1,4 +1,4 @@
-"""The page in a real browser, from file://, with hostile names of frames, classes and the run."""
+"""The page works in a real browser, from file://, with hostile names of frames, classes and the run."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def browser() -> Iterator[Chrome]:
 
 @pytest.fixture
 def opened(browser: Chrome, page: Path) -> Iterator[Chrome]:
-    """The page on a desk, by day; afterwards nothing may have been fetched, complained of, or run."""
+    """The page in a wide light window; at the end nothing may have been fetched, reported or run."""
     set_viewport(browser, 1280)
     open_page(browser, page)
     yield browser

@@ -1,4 +1,4 @@
-"""Whatever evidence says, or does not say, the field stays tame and its standard deviation honest."""
+"""With any evidence, or none, the field stays bounded and its standard deviation honest."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Detections of a rendered frame see no offset, and the one that its right image is warped by."""
+"""Detections of a rendered frame show no offset, or the offset by which its right image is warped."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def demo() -> LoadedFrame:
 
 
 def warped(frames: FrameBatch, disparity_px: float, rows_px: float) -> FrameBatch:
-    """Everything stands so far to the left and so far down in the right image."""
+    """The frame with the right image moved to the left and down by given amounts."""
     height, width = frames.images_right.shape[-2:]
     v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     uv = torch.stack([u + disparity_px, v - rows_px], dim=-1)
@@ -60,7 +60,7 @@ def test_true_boxes_see_what_the_right_image_is_warped_by(demo: LoadedFrame) -> 
 
 
 def with_other_principal_point(frames: FrameBatch, by_px: float) -> FrameBatch:
-    """The right image cut so far to the right, and its intrinsics with it."""
+    """The frame with the right image cropped at the left by a given amount, and with matching intrinsics."""
     K_right = frames.camera.K_right.clone()
     K_right[:, 0, 2] -= by_px
     return replace(warped(frames, by_px, 0.0), camera=replace(frames.camera, K_right=K_right))

@@ -1,4 +1,4 @@
-"""What a detector is off by is found from how far results lie from its boxes."""
+"""The errors of a detector are found from the distances of results from its boxes."""
 
 from __future__ import annotations
 

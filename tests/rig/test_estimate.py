@@ -1,4 +1,4 @@
-"""An estimate finds field and detector within what it says of itself, however its evidence comes."""
+"""An estimate finds field and detector within its own standard deviations, for evidence in any order."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_order_and_portions_do_not_matter_to_the_bit() -> None:
 
 
 def true_pixels() -> Tensor:
-    """400 pixels of known depth all over the image."""
+    """400 pixels of known depth over the whole image."""
     generator = torch.Generator().manual_seed(3)
     uv = torch.rand(400, 2, generator=generator, dtype=torch.float64) * (torch.tensor(SIZE_WH) - 1)
     noise = 0.1 * torch.randn(400, generator=generator, dtype=torch.float64)

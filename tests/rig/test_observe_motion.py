@@ -1,4 +1,4 @@
-"""From images to a field: a textured wall that comes nearer, read from a folder as the command does."""
+"""A field is estimated from images of a textured wall that comes nearer, read from a folder as by the command."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def texture(x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> NDArray[np.ui
 
 
 def write_sequence(root: Path) -> None:
-    """A left camera that drives towards a wall, and a right one whose disparity is off by `BIAS_PX`."""
+    """Write a left camera that drives towards a wall, and a right one whose disparity is wrong by `BIAS_PX`."""
     u, v = np.meshgrid(np.arange(float(SIZE[0])), np.arange(float(SIZE[1])))
     for number, depth in enumerate(DEPTHS_M):
         y_m = (v - 80) * depth / FOCAL_PX

@@ -1,4 +1,4 @@
-"""Pixels of known depth give back a known field under noise and wrong matches, by themselves and by the command."""
+"""Pixels of known depth recover a known field under noise and wrong matches, directly and by the command."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_a_point_right_behind_a_nearer_one_and_those_outside_are_left_out(tmp_pa
 
 
 def write_frame(root: Path, frame_id: str, bias_px: float, focal_px: float = FOCAL_PX) -> None:
-    """A frame of a smooth texture on an upright wall, measured disparity = true + bias."""
+    """Write a frame of a smooth texture on an upright wall, with measured disparity = true + bias."""
     training = root / "training"
     u, v = np.meshgrid(np.arange(float(SIZE[0])), np.arange(float(SIZE[1])))
     true = 12.0

@@ -1,4 +1,4 @@
-"""Motion and road give back a field that was put into them; a road alone is refused."""
+"""Motion and road recover a field that was put into them, and a road without motion is refused."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def camera() -> StereoCamera:
 
 
 def measured(uv: Tensor, depth: Tensor, generator: torch.Generator, noise_px: float) -> Tensor:
-    """Pixels, disparity with the field and noise on it, and the row shift of the geometry less 0.2 px."""
+    """Pixels, disparity with the field and noise, and the row shift of the geometry less 0.2 px."""
     rig = camera()
     displacement = disparity_of_depth(uv, depth, rig.K_left[0], rig.K_right[0], rig.T_right_cam[0])
     noise = noise_px * torch.randn(len(uv), generator=generator, dtype=torch.float64)
@@ -49,7 +49,7 @@ def motion(
     moving_share: float = 0.0,
     noise_px: float = 0.1,
 ) -> MotionConstraint:
-    """Points 5 to 60 m away, the camera driving ahead and turning a little; some points move by themselves."""
+    """Points 5 to 60 m away for a camera that drives ahead and turns a little; some points move by themselves."""
     generator, rig = torch.Generator().manual_seed(seed), camera()
     uv = random_pixels(500, generator)
     depth = 5 + 55 * torch.rand(500, generator=generator, dtype=torch.float64)
@@ -65,7 +65,7 @@ def motion(
 
 
 def road(seed: int, noise_px: float = 0.1, pitch: float = 0.0) -> RoadConstraint:
-    """A road that leans by a degree or two, seen from 4 to 30 m."""
+    """A road with a slope of a degree or two, seen from 4 to 30 m."""
     generator, rig = torch.Generator().manual_seed(seed), camera()
     normal = torch.tensor([0.01 * (seed % 3), -1.0, 0.01 * (seed % 2) + pitch], dtype=torch.float64)
     plane = -normal / normal.norm() / HEIGHT_M

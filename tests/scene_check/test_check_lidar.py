@@ -1,4 +1,4 @@
-"""Scans of the bundled frame, made of its surfaces: right ones raise no alarm, wrong ones are named."""
+"""Scans made of the bundled frame's surfaces give no finding if right, and wrong ones are named."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Points = NDArray[np.float32]
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Points]:
-    """The bundled frame with the place of a scanner, and points (P, 4) of what stereo sees, in the scanner's frame."""
+    """The bundled frame with the pose of a scanner, and stereo points (P, 4) in the scanner's frame."""
     root = tmp_path_factory.mktemp("demo")
     shutil.copytree(DEMO / "training", root / "training")
     shutil.copytree(DEMO / "detections" / "noisy_stereo", root / "detections")

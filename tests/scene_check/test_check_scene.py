@@ -1,4 +1,4 @@
-"""Mistakes in the tensors of a call are named, correct calls are left in peace; as a table in docs/check_data.md."""
+"""Mistakes in the tensors of a call are named, and correct calls give no finding; docs/check_data.md has the table."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Grey levels that are none of photographs, or other ones on each side, on the bundled frame."""
+"""Grey levels that are not those of photographs, or differ between the sides, are named on the bundled frame."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ def demo() -> Scene:
 
 
 def said_of(convention: BoxFormat, change: Callable[[Tensor, BoxFormat], Tensor], T: Tensor | None) -> CheckReport:
-    """Of the bundled frame, its boxes written rightly and then changed."""
+    """The findings about the bundled frame after its boxes are written correctly and then changed."""
     frames, cars = demo()
     boxes = poses_to_boxes(cars.T_cam_obj, cars.dimensions_hwl, convention, LIDAR.get(convention))
     given = change(boxes.clone(), convention)
@@ -53,7 +53,7 @@ def up(convention: BoxFormat) -> tuple[int, float]:
 
 
 def other_point(boxes: Tensor, convention: BoxFormat) -> Tensor:
-    """The centre for the bottom, or the bottom for the centre."""
+    """The centre in place of the bottom, or the bottom in place of the centre."""
     column, sign = up(convention)
     height = boxes[:, 3 + box_form(convention).sizes.index("h")]
     boxes[:, column] += sign * height * (-0.5 if box_form(convention).raised else 0.5)
@@ -74,7 +74,7 @@ def order(boxes: Tensor, convention: BoxFormat, wanted: str) -> Tensor:
 
 
 def wrong_order(convention: BoxFormat) -> str:
-    """One that makes the length another column, which shows in the image."""
+    """An order with the length in another column, which shows in the image."""
     sizes = box_form(convention).sizes
     return sizes[1:] + sizes[:1]
 
@@ -90,7 +90,7 @@ def scaled(boxes: Tensor, factor: float, columns: slice) -> Tensor:
 
 
 class Case(NamedTuple):
-    """A mistake, the check that names it, and words of what is said."""
+    """A `Case` is a mistake with the check that names it, and words of its finding."""
 
     change: Callable[[Tensor, BoxFormat], Tensor]
     check: str
@@ -159,7 +159,7 @@ def test_axes_of_another_frame(convention: BoxFormat) -> None:
 
 
 def quarter_turn(degrees: int) -> Tensor:
-    """The motion of a frame with z up to one that is turned about z."""
+    """The motion of a frame with z up to one that is rotated about z by 90 degrees."""
     c, s = round(math.cos(math.radians(degrees))), round(math.sin(math.radians(degrees)))
     return torch.tensor([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float32)
 

@@ -1,4 +1,4 @@
-"""The benchmark at its smallest size; no test here depends on how fast the machine is."""
+"""The benchmark runs at its smallest size; no test depends on the speed of the machine."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from helpers.car_counts import first_cars
 
 
 class FakeClock:
-    """Stands still until something takes time."""
+    """A `FakeClock` stands still until something takes time."""
 
     def __init__(self) -> None:
         self.now = 0.0

@@ -1,4 +1,4 @@
-"""The prior of a few parametric cars is a file that the refiner takes."""
+"""The prior of a few parametric cars is a file that the refiner accepts."""
 
 from __future__ import annotations
 

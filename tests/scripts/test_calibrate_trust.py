@@ -1,4 +1,4 @@
-"""The noise of the images and the regression are found again, and the tables of harm and reliability are printed."""
+"""The noise of the images and the regression are recovered, and tables of harm and reliability are printed."""
 
 from __future__ import annotations
 

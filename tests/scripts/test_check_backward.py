@@ -1,4 +1,4 @@
-"""Gradients of whole refinements of the bundled frame: a network in front learns from all of a box."""
+"""Gradients of whole refinements of the bundled frame reach all numbers of a box."""
 
 from __future__ import annotations
 

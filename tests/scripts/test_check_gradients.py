@@ -1,4 +1,4 @@
-"""The command: exit codes, files, clear messages; a wrong Jacobian is reported as broken."""
+"""These tests check the exit codes, files and messages of the command, and that it reports a wrong Jacobian."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The comparison of tracks with cars by themselves: what counts as turning, as worse, and where faces are."""
+"""These tests check when a car counts as turning or worse, and where its faces are, in the comparison of tracks."""
 
 from __future__ import annotations
 

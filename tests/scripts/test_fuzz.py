@@ -1,4 +1,4 @@
-"""The script that calls, damages and disturbs by the thousand: a few of each, and what it does with a finding."""
+"""The script makes a few calls, damages and disturbances of each kind, and reports a finding."""
 
 from __future__ import annotations
 

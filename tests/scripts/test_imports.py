@@ -1,4 +1,4 @@
-"""What scripts and examples import from the package is there, those that no test runs included."""
+"""All imports from the package in scripts and examples exist, also in those that no test runs."""
 
 from __future__ import annotations
 

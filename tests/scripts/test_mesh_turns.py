@@ -1,4 +1,4 @@
-"""The table of turns and units that are found, on one car."""
+"""The table of rotations and units is right for one car."""
 
 from __future__ import annotations
 

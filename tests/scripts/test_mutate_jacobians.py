@@ -1,4 +1,4 @@
-"""Mutants are what they claim to be, the tests named for them exist, and a survivor is reported; a sample is run."""
+"""Mutants are what they claim, their tests exist, and a survivor is reported; a sample is run."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_every_exclusion_is_of_a_mutant_that_is_made() -> None:
 
 @pytest.fixture
 def small_tree(tmp_path: Path) -> tuple[Path, Target]:
-    """A module whose tests see its product but not its sum."""
+    """A module whose tests check its product but not its sum."""
     (tmp_path / "small_module_for_mutants.py").write_text(
         "def f(a, b):\n    return a * b\n\n\ndef g(a):\n    return a + 0\n"
     )

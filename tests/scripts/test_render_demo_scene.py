@@ -1,4 +1,4 @@
-"""The generator of demo frames: conventions, layout, labels and files; the renderer only where it is installed."""
+"""The generator of demo frames is checked in conventions, layout, labels and files, and rendered if possible."""
 
 from __future__ import annotations
 

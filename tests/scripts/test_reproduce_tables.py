@@ -1,4 +1,4 @@
-"""The experiments: rows are valid settings that change something, and a table comes out of a tiny data set."""
+"""The rows of experiments are valid settings that change something, and a tiny data set gives a table."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The training of the neural prior on a handful of cars: white codes, fitted dimensions, the same bytes twice."""
+"""The training of the neural prior on a few cars gives white codes, fitted dimensions, and the same bytes twice."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Meshes with wrong axes, units or parts are refused with the options that they need; cars as they are pass."""
+"""Meshes with wrong axes, units or parts are refused with the options that they need, and right ones pass."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ AUTOGRAD = replace(DEFAULT, solver=replace(DEFAULT.solver, jacobian="autograd"))
 
 
 class Wrapped(nn.Module):
-    """The ellipsoids, with a fault that a test puts in by overriding one method."""
+    """A `Wrapped` has the ellipsoids with a fault that a test adds by overriding one method."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -33,7 +33,7 @@ class Wrapped(nn.Module):
 
 
 class OnlyValues:
-    """A bound shape that knows no derivatives."""
+    """An `OnlyValues` is a bound shape without derivatives."""
 
     def __init__(self, shape: GridShape) -> None:
         self.value = shape.value
@@ -57,7 +57,7 @@ class TransposedCodeDerivative(Wrapped):
 
 
 class Detached(Wrapped):
-    """Derivatives of its own, but none that autograd could find."""
+    """A `Detached` has its own derivatives, but none that autograd could find."""
 
     def bind(self, code: Tensor) -> GridShape:
         return self.inner.bind(code.detach())
@@ -70,7 +70,7 @@ class DetachedShape(GridShape):
 
 
 class DetachedGradient(Wrapped):
-    """Values with a graph, but a gradient without: second derivatives would be wrong without a word."""
+    """A `DetachedGradient` has values with a graph and a gradient without, so second derivatives would be wrong."""
 
     def bind(self, code: Tensor) -> DetachedShape:
         shape = self.inner.bind(code)

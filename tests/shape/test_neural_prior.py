@@ -1,4 +1,4 @@
-"""The network prior: its formula by hand, its symmetry, and that its weights can be trained through the field."""
+"""The network prior agrees with its formula by hand, is symmetric, and can be trained through the field."""
 
 from __future__ import annotations
 

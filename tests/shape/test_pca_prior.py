@@ -15,7 +15,7 @@ ORIGIN = torch.tensor([-2.0, -2.0, -1.0], dtype=torch.float64)
 
 
 def box_samples(count: int = 40, seed: int = 0) -> torch.Tensor:
-    """Boxes on the ground whose length and height vary; width fixed."""
+    """Boxes on the ground with varying length and height and fixed width."""
     generator = torch.Generator().manual_seed(seed)
     axes = [ORIGIN[k] + SPACING_M * torch.arange(SHAPE[k], dtype=torch.float64) for k in range(3)]
     nodes = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)

@@ -1,4 +1,4 @@
-"""Files of priors of every kind: round trips, dispatch by content, and what is said of a wrong or truncated file."""
+"""Files of priors of every kind are read back by their content, and wrong or truncated files are named."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the refiner needs of a shape prior, asked of every kind: the same tests, whatever the encoding."""
+"""These tests check what the refiner needs of a shape prior, for every kind of encoding."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def codes(prior: ShapePrior, regime: str, count: int = 2) -> Tensor:
 
 
 def points_in(prior: ShapePrior, count: int, seed: int = 0, stretch: float = 1.0) -> Tensor:
-    """Random points of the bounds, or of the stretched bounds; none lies on a border of cells."""
+    """Random points of the bounds, or of the stretched bounds, none on a border of cells."""
     share = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     lower, upper = prior.bounds_obj
     return 0.5 * (lower + upper) + stretch * (share - 0.5) * (upper - lower)

@@ -1,4 +1,4 @@
-"""Refinement with a prior of every kind: it converges, by either Jacobian, and gradients pass through it."""
+"""Refinement with a prior of every kind converges with either Jacobian, and gradients pass through it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LIGHT = replace(DEFAULT, sampling=replace(DEFAULT.sampling, min_pixels=100, max_
 
 @pytest.fixture(scope="module")
 def scene_of() -> Callable[[str], Street]:
-    """A car at 9 m whose code is not the mean's, of the prior itself; rendered once a kind."""
+    """A car at 9 m with a code other than the mean's, of the prior itself, rendered once for each kind."""
     scenes: dict[str, Street] = {}
 
     def scene(kind: str) -> Street:

@@ -1,4 +1,4 @@
-"""Grids: lookups in every form against a slow loop over the corners and autograd, blocks of points, the zero level."""
+"""Grid lookups of every form agree with a slow loop over corners and autograd, also in blocks and at the zero level."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LookUp = Callable[[GridField, Tensor, Tensor], Lookup]
 
 @pytest.fixture(params=["to be differentiated", "constant", "as a compiler traces it"])
 def look_up(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> LookUp:
-    """The last one as Python, without a compiler: only the question whether one is at work is answered otherwise."""
+    """A lookup in each form; the last one runs as Python while the package is told that a compiler is at work."""
     if request.param == "as a compiler traces it":
         monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
     constant = request.param == "constant"
@@ -44,13 +44,13 @@ def random_shape(num_objects: int = 2, num_codes: int = 3, dtype: torch.dtype = 
 
 
 def points(count: int = 75, stretch: float = 1.6) -> Tensor:
-    """(P, 3), by default two thirds of them outside of the grid."""
+    """Points (P, 3), by default two thirds of them outside the grid."""
     share = torch.rand(count, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
     return 0.5 * (ORIGIN + LAST) + stretch * (LAST - ORIGIN) * (share - 0.5)
 
 
 def slow_lookup(grid: Tensor, point: Tensor) -> Tensor:
-    """Trilinear interpolation of one point by the weights of its eight corners, continued outside by the distance."""
+    """Trilinear interpolation of one point by its eight corners, continued outside by the distance."""
     clamped = point.clamp(ORIGIN, LAST)
     position = (clamped - ORIGIN) / SPACING
     lower = [min(int(position[i]), COUNTS[i] - 2) for i in range(3)]

@@ -1,4 +1,4 @@
-"""One damped step: exact solution, Marquardt scaling, singular and broken systems, trust region."""
+"""A damped step solves exactly, scales by Marquardt, handles singular and broken systems, and keeps to its region."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Derivatives of a minimum: both ways against differences of the minimisation itself, and against each other."""
+"""Derivatives of a minimum agree both ways with differences of the minimisation itself, and with each other."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ STAGES = [StageConfig(2.0, 1, 30), StageConfig(1.0, 0, 60)]
 
 
 class Curved(VectorProblem):
-    """B curved least-squares problems in two unknowns that do not fit exactly; `theta` (B, 3) are their data.
+    """A `Curved` has B curved least-squares problems in two unknowns with nonzero residuals; `theta` (B, 3) are data.
 
-    The residuals of the first stage are scaled: it has another minimum than the last one.
+    The residuals of the first stage are scaled, so it has another minimum than the last one.
     """
 
     def __init__(self, theta: Tensor, stages: Sequence[StageConfig] = STAGES, bound: float = torch.inf) -> None:
@@ -88,7 +88,7 @@ def _minimum(problem: Curved, start: Tensor, config: SolverConfig = EXACT) -> Mi
 
 
 def _polished(problem: Curved, minimum: Minimum[Vector]) -> Minimum[Vector]:
-    """Costs decide to 1e-8 of the state only; differences of minima need more digits."""
+    """The minimum after further Newton steps, as differences of minima need more digits than costs decide."""
     state = minimum.state
     for _ in range(60):
         at = problem.energy(state.x)

@@ -1,4 +1,4 @@
-"""The loop: known minima, independence of the problems, failures, acceptance, compaction, stages."""
+"""The solver's loop finds known minima, keeps problems independent and handles failures, acceptance and stages."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def start(count: int, unknowns: int = 3, value: float = 0.0) -> Vector:
 
 
 def rosenbrock(count: int, stages: list[StageConfig] = ONE_STAGE, limit: float = 1.0) -> ResidualProblem:
-    """A curved valley of a width of its own for each problem; minimum at (1, 1), cost 0."""
+    """A curved valley with another width for each problem; the minimum is at (1, 1) with cost 0."""
 
     def residual(x: Tensor, identity: Tensor) -> Tensor:
         steep = 3.0 + identity.to(x.dtype)

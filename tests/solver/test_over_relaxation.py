@@ -1,4 +1,4 @@
-"""Steps that are longer than Gauss-Newton's: by how much, when, and what they are good for."""
+"""Steps that are longer than Gauss-Newton's have the right length and time, and reduce iterations."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FACTOR = 1.6
 
 
 class GeometricMedians(VectorProblem):
-    """The points with the least sum of distances to others, by reweighting: the matrix lacks what the weights do."""
+    """A `GeometricMedians` has points of least sum of distances to others, by reweighting without its derivative."""
 
     def __init__(self, points: Tensor, stages: Sequence[StageConfig]) -> None:
         super().__init__(stages, num_unknowns=2)
@@ -87,7 +87,7 @@ def test_what_was_refused_is_tried_again_plain(solver: dict[str, float]) -> None
 
 
 class Bent(ResidualProblem):
-    """A distance to 1 whose matrix is too small by a factor, so that plain steps are so many times too long."""
+    """A `Bent` is a distance to 1 whose matrix is too small by a factor, so plain steps are too long by that factor."""
 
     def __init__(self, factor: float, stages: Sequence[StageConfig]) -> None:
         super().__init__(
@@ -148,7 +148,7 @@ def test_two_steps_in_a_row_that_overshoot_are_not() -> None:
 
 def test_a_candidate_that_is_not_finite_is_not_the_end() -> None:
     class Broken(Bent):
-        """Beyond 1.2 there is a lower cost, but nothing else."""
+        """A problem with a lower cost beyond 1.2, where other values are broken."""
 
         def energy(self, x: Tensor) -> Energy:
             at = super().energy(x)

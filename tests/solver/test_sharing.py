@@ -1,4 +1,4 @@
-"""Groups of problems that share unknowns, against the dense systems and minima of all their unknowns together."""
+"""Groups of problems that share unknowns agree with dense systems and minima of all their unknowns together."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def systems() -> tuple[Tensor, Tensor]:
 
 
 def places(rows: list[int]) -> list[list[int]]:
-    """Where the unknowns of each problem of a group stand among those of all: own ones, then the shared ones."""
+    """Positions of each problem's unknowns among those of its group: own ones, then the shared ones."""
     first_shared = len(rows) * len(OWN)
     found = []
     for k in range(len(rows)):
@@ -96,7 +96,7 @@ CHAIN, PLACE = (1, 8, 1, 8, 3, 1), (1, 0, 0, 1, 0, 2)
 
 
 def chain(numbers: list[int]) -> tuple[Groups, dict[int, list[int]]]:
-    """Those of the problems, and where the unknowns of group 1 stand: of each three own ones, then two shared ones."""
+    """Positions of the problems' unknowns and of group 1's: three own ones for each, then two shared ones."""
     own, shared, of_next = torch.arange(3), torch.arange(3, 5), torch.tensor([5])
     whole = Groups.of(CHAIN, own, shared, of_next, PLACE)
     at = {2: [0, 1, 2, 9, 10, 3], 0: [3, 4, 5, 9, 10, 6], 5: [6, 7, 8, 9, 10, 11]}

@@ -1,4 +1,4 @@
-"""Unknowns: the columns of blocks, Jacobians put in their places, steps and their limits, stages and bounds."""
+"""These tests check columns of blocks, placed Jacobians, steps and their limits, stages and bounds of unknowns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The points of each car: where they lie, which pass the filters, and how many are kept."""
+"""These tests check where the points of each car are, which pass the filters, and how many are kept."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ALL = PointCloudConfig(min_points=1, max_points=100_000)
 
 @pytest.fixture(autouse=True)
 def wide(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Limits that leave out no point of the street, but where a test sets others."""
+    """Limits that leave out no point of the street, except where a test sets others."""
     monkeypatch.setattr(points_of_cars, "_HEIGHTS_M", (-99.0, 99.0))
     monkeypatch.setattr(points_of_cars, "_REACH_M", 1e3)
 

@@ -1,4 +1,4 @@
-"""Disparity maps of frames: those that they bring, OpenCV's, and those of an optional package."""
+"""Disparity maps come from the frames, from OpenCV, or from an optional package."""
 
 from __future__ import annotations
 

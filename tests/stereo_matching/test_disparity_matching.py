@@ -1,4 +1,4 @@
-"""Matching and its sub-pixel refinement against images whose disparity is known by construction."""
+"""Matching and its sub-pixel refinement agree with images of known disparity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Disparity to depth and back for general right cameras, and the ground plane through such points."""
+"""Disparity and depth are converted both ways for general right cameras, and a ground plane fits such points."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_field_takes_the_bias_off_the_measured_disparity() -> None:
 
 
 def road_with_clutter(seed: int) -> tuple[Tensor, Tensor]:
-    """Points of a leaning road with 3 cm of noise, and 40 percent of walls and cars above it."""
+    """Points of a sloped road with 3 cm of noise, and 40 percent of walls and cars above it."""
     generator = torch.Generator().manual_seed(seed)
     x, z = (torch.rand(3000, generator=generator).double() * s + o for s, o in ((16, -8), (35, 4)))
     model = torch.tensor([0.015, -0.01, 1.66], dtype=torch.float64)

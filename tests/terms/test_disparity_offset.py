@@ -1,4 +1,4 @@
-"""The unknown offset of a car's disparity: what it does to the warp, what it gives way to, and where it is held."""
+"""These tests check the unknown offset of a car's disparity: its effect on the warp, its prior, its limits."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ UNSURE = replace(DEFAULT, rig=RigConfig(disparity_sigma_px=1.0))
 
 @cache
 def rectified_street() -> Street:
-    """The right camera beside the left one: there a constant field of disparities is exactly an offset."""
+    """A street with a right camera exactly beside the left one, where a constant disparity field is an offset."""
     T_right_cam = torch.eye(4, dtype=torch.float64)
     T_right_cam[0, 3] = -0.53
     return street(ellipsoid_prior(), *TWO_CARS, T_right_cam=T_right_cam)
@@ -39,7 +39,7 @@ def _with_field(frames: FrameBatch, value_px: float) -> FrameBatch:
 
 
 def _unsure(detections: Detections) -> Detections:
-    """The disparities of the cars may be off by a pixel, whatever field their frames have."""
+    """The disparities of the cars may be wrong by a pixel, whatever field their frames have."""
     return replace(detections, offset_sigma_px=torch.ones(len(detections), dtype=torch.float64))
 
 

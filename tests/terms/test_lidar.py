@@ -1,4 +1,4 @@
-"""Which points are a car's, and what the term "lidar" makes of them."""
+"""These tests check which points belong to a car, and the residuals of the term "lidar"."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SCENE = street(PRIOR, *TWO_CARS)
 
 
 def seen(car: int, depth_offset: float = 0.0) -> Tensor:
-    """Points (P, 3) on some rays of the left mask of a car, at the depth of its origin or off it."""
+    """Points (P, 3) on some rays of a car's left mask, at the depth of its origin or at an offset from it."""
     d = SCENE.detections
     v, u = (d.mask_left.dense()[car] > 0.5).nonzero(as_tuple=True)
     rays = rays_from_pixels(torch.stack([u, v], dim=-1).to(d.score), SCENE.frames.camera.K_left)

@@ -1,4 +1,4 @@
-"""What a user's term knows of each car goes with the cars that leave; mistakes are named before the first step."""
+"""Per-car values of a user's term follow the cars that leave; mistakes are named before the first step."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def to_radar(_: CarBatch, state: CarState, radar_cam: Tensor) -> PriorResidual:
 
 
 def boxes(*order: int) -> Detections:
-    """Two cars, three disturbed boxes of each: they end in different iterations."""
+    """Two cars with three disturbed boxes each, which end in different iterations."""
     found = cached_street()[1].detections
     parts = [disturbed(found, 0.05 + 0.1 * n, 0.02 + 0.02 * n, seed=n) for n in range(COPIES)]
     return select(Detections.joined(parts), torch.tensor(order or range(2 * COPIES)))
 
 
 def measured(detections: Detections) -> Tensor:
-    """A radar that is off by another distance for each box, known by its own position."""
+    """A radar with another error of distance for each box, which is known by its own position."""
     at = detections.T_cam_obj[:, :3, 3]
     return at + torch.stack([0.2 * torch.sin(40 * at[:, 2]), 0 * at[:, 0], 0.2 * torch.cos(40 * at[:, 2])], dim=-1)
 
@@ -56,7 +56,7 @@ def radar(change: Callable[[Tensor], Any] = lambda x: x, weight: Any = WEIGHT, n
 
 
 def closed_over(of_call: Callable[..., Tensor], change: Callable[[Tensor], Tensor] = lambda x: x) -> TermFactory:
-    """The radar as a residual that takes it from around itself, by a function of the table and the cars."""
+    """The radar as a residual that takes its positions from the enclosing scope, by a function of table and cars."""
 
     def make(*scene: Any) -> PriorTerm:
         table = change(measured(scene[1]))
@@ -77,7 +77,7 @@ def refine(*extra: TermFactory, detections: Detections, config: RefinerConfig = 
 
 @cache
 def together() -> RefinementResult:
-    """All boxes in one call; nobody changes it."""
+    """All boxes in one call; the result must not be changed."""
     return refine(radar(), detections=boxes())
 
 
@@ -215,7 +215,7 @@ def test_rows_found_by_the_numbers_of_the_detections_are_right() -> None:
 
 @dataclass(frozen=True)
 class Keeping(PriorTerm):
-    """A term whose own table of the cars is cut where the wrong cars leave."""
+    """A `Keeping` is a term with its own table of the cars, which is cut wrongly when cars leave."""
 
     table: Tensor | None = None
 

@@ -1,4 +1,4 @@
-"""The photometric term: warp by hand, what is fixed in a stage, what a lost pixel pays, brightness, occlusion."""
+"""These tests check the photometric term: warp by hand, fixed sets, lost pixels, brightness, occlusion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One brightness for both images of a car."""
+"""One brightness match serves both images of a car."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def _left() -> tuple[Tensor, Tensor]:
 
 
 def _matched(form: Brightness, left: Tensor, right: Tensor, weight: Tensor) -> Tensor:
-    """Rows (P, 8), each pixel a block of its own; the third car has no pixels."""
+    """Rows (P, 8) with a block for each pixel; the third car has no pixels."""
     of_blocks = [x.mT[..., None] for x in (left, right, weight)]
     found = matched_brightness(form, of_blocks[0], of_blocks[1], of_blocks[2], CAR, 3)
     return found[..., 0].mT

@@ -1,4 +1,4 @@
-"""Points of a car: signs by hand, weights of the methods, cars that lack points, gradients to the points."""
+"""These tests check points of a car: signs by hand, weights of the methods, cars without points, gradients."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_gradient_to_the_points() -> None:
 
 
 class _Known(PointCloud):
-    """Points whose norm has a weight of its own for the Fisher matrix, as one of a user may."""
+    """A `_Known` has points whose norm has its own weight for the Fisher matrix, as a user's may have."""
 
     def norm(self, residual: Tensor) -> RobustValue:
         return super().norm(residual)._replace(information_weight=3 + residual)

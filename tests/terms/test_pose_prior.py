@@ -1,4 +1,4 @@
-"""The detector's pose with its uncertainty: where the standard deviations come from, and what they do to the result."""
+"""These tests check the detector's pose prior: the source of its standard deviations, and its effect on results."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _start(pose_sigma: Tensor | None = None) -> Detections:
 
 @cache
 def _plain() -> RefinementResult:
-    """Without standard deviations; nobody changes it."""
+    """The result without standard deviations, which must not be changed."""
     return _refined(_start())
 
 

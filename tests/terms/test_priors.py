@@ -1,4 +1,4 @@
-"""Priors: Jacobians three ways, numbers by hand, and the trap of the paper's rotation prior."""
+"""Priors have right Jacobians in three ways and right numbers, and the paper's rotation prior has its known defect."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Robust norms: value, gradient weight and matrix weight belong together."""
+"""Value, gradient weight and matrix weight of robust norms belong together."""
 
 from __future__ import annotations
 

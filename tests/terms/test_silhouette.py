@@ -1,4 +1,4 @@
-"""Silhouettes, both forms: figures by hand, log space, saturation, and where the contour lies."""
+"""Silhouettes in both forms agree with figures by hand, in log space and saturation, and have a right contour."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ def _true_contour(depth_m: float) -> tuple[Tensor, Tensor]:
 
 
 def _dilation_px(depth_m: float, contour_px: float, form: str) -> Tensor:
-    """How far outside (24,) the true outline the 0.5 contour lies, by bisection."""
+    """Distance (24,) of the 0.5 contour outside the true outline, by bisection."""
     points, normal = _true_contour(depth_m)
     low, high = (torch.full((len(points),), x, dtype=torch.float64) for x in (-4.0, 4.0))
     for _ in range(25):

@@ -1,4 +1,4 @@
-"""A view against the next one of its track: derivatives, which pixels count, and what it is worth."""
+"""A view compared with the next one of its track has right derivatives and pixels, and improves results."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CODE = torch.tensor([[0.9, -0.4, 0.5], [-0.8, 0.3, -0.4]], dtype=torch.float64)
 
 @cache
 def drive() -> tuple[FrameBatch, Detections]:
-    """A car that turns and one that comes nearer, with their true boxes; nobody changes it."""
+    """A car that turns and one that comes nearer, with their true boxes, which must not be changed."""
     height = CAMERA_HEIGHT_M
     seen: list[Street] = [
         street(
@@ -50,7 +50,7 @@ def drive() -> tuple[FrameBatch, Detections]:
 def at_truth(
     frames: FrameBatch, detections: Detections, num_offsets: int = 0, config: RefinerConfig = DEFAULT
 ) -> tuple[CarProblem, TrackState]:
-    """The problem of the next views alone, and the true state."""
+    """The problem of the next views only, and the true state."""
     detections = replace(detections, offset_sigma_px=torch.full((6,), 0.3).double() if num_offsets else None)
     problem, state = DirectShapeRefiner(ellipsoid_prior(), config).problem(frames, detections)
     stereo = next(each for each in problem.evidence if isinstance(each, PhotometricEvidence))
@@ -68,7 +68,7 @@ def begun(problem: CarProblem, state: TrackState, stage: int = 1) -> tuple[NextV
 
 
 def disturbed(state: TrackState) -> TrackState:
-    """Off by centimetres; the copies of the next views' poses by others than these views, which is no matter here."""
+    """The state moved by centimetres; the copied poses of the next views are moved by other amounts."""
     generator = torch.Generator().manual_seed(3)
     delta = torch.randn(6, state.unknowns.size, generator=generator, dtype=torch.float64)
     return state.unknowns.retract(state, 0.01 * delta)
@@ -165,7 +165,7 @@ def test_a_next_view_without_a_left_mask_shows_nothing() -> None:
 
 
 def shifted(values: Tensor, row: int, by: int) -> Tensor:
-    """Values (N, ..., W) of which one row has lost its first columns, padded behind."""
+    """Values (N, ..., W) of which one row has lost its first columns, padded at the end."""
     values = values.clone()
     values[row] = torch.nn.functional.pad(values[row, ..., by:], (0, by))
     return values

@@ -1,4 +1,4 @@
-"""The motion prior: derivatives, the path that fits, and what it does to the views of a track."""
+"""The motion prior has right derivatives and the right path, and its effect on the views of a track is right."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def random(*shape: int, seed: int = 0) -> Tensor:
 
 
 def views(with_camera: bool, num_offsets: int = 0) -> tuple[CarBatch, TrackState]:
-    """Five views at random."""
+    """Five random views."""
     cars, T_obj_cam = cars_on(random(3), random(1), 5), se3.exp(random(5, 6))
     T_world_cam = se3.exp(random(5, 6, seed=1)) if with_camera else None
     offset_px, path = random(5, num_offsets, seed=3), random(5, 9, seed=4)
@@ -115,7 +115,7 @@ def test_the_fitted_path_is_the_cheapest_for_views_where_they_are() -> None:
 
 @cache
 def seen() -> tuple[FrameBatch, Detections]:
-    """Three frames of a car that goes straight on, with boxes that are off; nobody changes it."""
+    """Three frames of a car that drives straight ahead, with disturbed boxes, which must not be changed."""
     prior, code = ellipsoid_prior(), torch.tensor([[0.5, -0.4, 0.3]], dtype=torch.float64)
     views = [street(prior, [(-1.0, CAMERA_HEIGHT_M, 9.0 + n)], [1.3], code) for n in range(3)]
     detections = joined_detections([view.detections for view in views], (120, 160))
@@ -124,7 +124,7 @@ def seen() -> tuple[FrameBatch, Detections]:
 
 
 def drive(time_s: Tensor | None, T_world_cam: Tensor | None = None) -> tuple[FrameBatch, Detections]:
-    """They at these times, from a camera that goes there."""
+    """The three frames at these times, from a camera that moves."""
     frames, detections = seen()
     return replace(frames, time_s=time_s, T_world_cam=T_world_cam), detections
 
@@ -143,7 +143,7 @@ AT = torch.tensor([0.0, 0.1, 0.2], dtype=torch.float64)
 
 
 def bend(result: RefinementResult) -> float:
-    """Second difference of the places, metres."""
+    """Second difference of the positions, metres."""
     x = result.T_cam_obj[:, :3, 3]
     return float((x[0] - 2 * x[1] + x[2])[[0, 2]].norm())
 

@@ -1,4 +1,4 @@
-"""What makes the views of a track be those of two cars: their shapes, and their looks."""
+"""The views of a track are split into two cars by their shapes and their looks."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def track(num_views: int) -> Any:
 
 
 def parts(codes: list[float], unlike: list[float]) -> list[list[int]]:
-    """Of one track, by shapes and then by looks."""
+    """Parts of one track, by shapes and then by looks."""
     says = says_of(codes)
     by_shape = parts_by_shape(track(len(codes)), says, torch.ones(len(codes), dtype=torch.bool))
     (of_track,) = cut_once(by_shape, says, torch.tensor(unlike, dtype=torch.float64))
@@ -87,7 +87,7 @@ def test_shapes_alone_cut_as_often_as_they_must() -> None:
 
 
 def unlike(change: str | None = None) -> Tensor:
-    """How unlike the next a car looks that turns by six degrees, with masks that are changed."""
+    """Difference of looks between consecutive views of a car that turns by six degrees, with changed masks."""
     # The first image is larger, so that the second ends within the padding.
     seen = [
         street(ellipsoid_prior(), [(0.2, CAMERA_HEIGHT_M, 8.0)], [-1.2 + 0.1 * n], size_wh=size)

@@ -1,4 +1,4 @@
-"""The same car in several frames: one shape, many poses, and nothing changed for cars by themselves."""
+"""The same car in several frames gets one shape and many poses, and cars without tracks are unchanged."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ HEADINGS = (0.3, 1.2, 2.4)
 
 @cache
 def drive(contrast: float = 1.0) -> tuple[FrameBatch, Detections, Tensor]:
-    """Three frames of a car that turns and of another one that stands: frames, boxes that are off, the true codes."""
+    """Three frames of a car that turns and of a still one: frames, disturbed boxes, the true codes."""
     prior = ellipsoid_prior()
     code = contrast * torch.tensor([[0.9, -0.4, 0.5], [-0.8, 0.3, -0.4]], dtype=torch.float64)
     height = CAMERA_HEIGHT_M
@@ -69,13 +69,13 @@ def refined(detections: Detections, track_id: list[int] | None = None, contrast:
 
 @cache
 def by_themselves() -> RefinementResult:
-    """All six detections without tracks; nobody changes it."""
+    """The result of all six detections without tracks, which must not be changed."""
     return refined(drive()[1])
 
 
 @cache
 def of_tracks(*track_id: int) -> RefinementResult:
-    """The six detections with these tracks; nobody changes it."""
+    """The result of the six detections with these tracks, which must not be changed."""
     return refined(drive()[1], list(track_id))
 
 
@@ -211,7 +211,7 @@ def test_a_view_that_the_images_do_not_confirm_does_not_join() -> None:
 
 
 def doubt(monkeypatch: pytest.MonkeyPatch, *in_track: int, alone: int | None = None, num_rows: int = 6) -> list[int]:
-    """Have views of a call or a track of so many rows not trusted, together or by itself; the sizes of all calls."""
+    """Make views untrusted in calls or tracks of so many rows; return the sizes of all calls."""
     sizes: list[int] = []
 
     def judged(minimum: Minimum[AnyState], initial: AnyState, *args: Any) -> tuple[Minimum[AnyState], RefinementResult]:

@@ -1,4 +1,4 @@
-"""Projection of views, contours and boxes against hand-derived pixels; the signs of a disparity field."""
+"""Projections of views, contours and boxes agree with hand-derived pixels, and field colours with signs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The data behind the figures of a car and its maps of residuals: the energy's own values, in the right places."""
+"""The data behind the figures of a car and its residual maps are the energy's own values, in the right places."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_cars_that_did_not_take_part_are_refused(course: CarCourse) -> None:
 def at_the_end(
     course: CarCourse, loaded: LoadedFrame, shift_m: tuple[float, float, float] = (0, 0, 0), *words: str
 ) -> CarResiduals:
-    """The map of residuals that a page shows, of the car where its refinement ended, or moved away from there."""
+    """The residual map of a page for the car at the end of its refinement, or moved away from there."""
     result, rows = course.trace.result, torch.tensor([0, _CAR])
     T_cam_obj = result.T_cam_obj[rows].numpy().copy()
     T_cam_obj[:, :3, 3] += shift_m

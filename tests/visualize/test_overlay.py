@@ -1,4 +1,4 @@
-"""The picture of a frame: drawn where the cars are, whatever their state."""
+"""The picture of a frame shows the cars where they are, in every state."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_far_truth_is_left_out_of_the_scale() -> None:
 
 
 def call_of_two_frames() -> tuple[FrameBatch, Detections, RefinementResult]:
-    """The street twice, its second car in the second frame; the first one has no masks and is not refined."""
+    """The street twice, its second car in the second frame; the first frame has no masks and is not refined."""
     prior, street = cached_street()
     d = disturbed(street.detections)
     seen = torch.tensor([False, True])

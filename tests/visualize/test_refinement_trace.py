@@ -1,4 +1,4 @@
-"""The trace against the refiner itself: same ends, same costs, complete states."""
+"""The trace agrees with the refiner in ends and costs, and has complete states."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def demo_frame() -> LoadedFrame:
 
 
 def _with_lost_car(detections: Detections) -> Detections:
-    """The first car has no pose, so it takes no part."""
+    """The detections with a first car without a pose, which takes no part."""
     T_cam_obj = detections.T_cam_obj.clone()
     T_cam_obj[0, :3, 3] = torch.nan
     return replace(detections, T_cam_obj=T_cam_obj)
