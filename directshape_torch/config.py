@@ -195,36 +195,22 @@ class PhotometricConfig(Settings):
 
 @dataclass(frozen=True)
 class PointCloudConfig(Settings):
-    """Point cloud from dense stereo, for the methods "geometric" (Engelmann et al., GCPR 2016) and "combined"."""
+    """Point cloud from dense stereo (Engelmann et al., GCPR 2016), which the presets "geometric" and "combined" fit."""
 
     weight: float = setting(
-        300.0,
-        'factor of the mean Huber norm of the signed distances, per square metre, for "geometric"; "combined" takes a '
-        "tenth of it: beside the images less is better",
+        0.0,
+        "factor of the mean Huber norm of the signed distances, per square metre; 0: no point cloud. Points alone need "
+        "300, points beside the images 30",
         at_least=0,
     )
     huber_m: float = setting(0.1, "corner of the Huber norm", above=0)
     min_points: int = setting(
         200,
-        'a car with fewer points keeps its input under "geometric" (status too_few_points) and has images only under '
-        '"combined"',
+        "a car with fewer points is fitted to the images alone; without images it keeps its input (status "
+        "too_few_points)",
         at_least=0,
     )
     max_points: int = setting(1000, "most points of a car: of more, every n-th is used", above=0, at_least="min_points")
-    order: Literal["alternating", "joint"] = setting(
-        "alternating",
-        '"alternating" (pose, then shape, as in the paper by Engelmann et al.) or "joint", for "geometric"; the other '
-        "methods follow `stages`",
-    )
-    rounds: int = setting(
-        8,
-        "rounds of the alternation at most; once the cost has settled the rest changes nothing",
-        at_least=1,
-        at_most=1000,
-    )
-    max_iterations: int = setting(
-        4, "Gauss-Newton iterations of one half of a round, or of the joint refinement", at_least=1
-    )
 
 
 @dataclass(frozen=True)
@@ -253,7 +239,7 @@ class PriorConfig(Settings):
     detector_weight: float = setting(
         1.0,
         "weight of the detector's boxes against those of the images where a rig knows what both are off by (see "
-        "docs/derivations/fusion.md); 0: the images' boxes alone",
+        "docs/derivations/fusion.md); 0: the images' boxes alone, as for terms whose errors nobody measured",
         at_least=0,
     )
     pose_weight: float = setting(
@@ -354,11 +340,6 @@ class AcceptanceConfig(Settings):
 class RefinerConfig(Settings):
     """Everything `DirectShapeRefiner` can be told."""
 
-    method: Literal["direct", "geometric", "combined", "box_alignment"] = setting(
-        "direct",
-        'terms of the energy: "direct" (images), "geometric" (a baseline: point cloud) or "combined" (both); or '
-        "\"box_alignment\" (Stereo R-CNN's: the detector's boxes moved in depth, by photometry)",
-    )
     compile: Literal["auto", "on", "off"] = setting(
         "auto",
         'compile the hot functions: "on", "off", or "auto" (where there is a C++ compiler and the command refine has '
@@ -390,10 +371,16 @@ class RefinerConfig(Settings):
         if not self.stages:
             raise ConfigError("stages: expected at least one stage, got none")
         # Implicit gradients belong to the final stage, in which both pose and shape must have settled.
-        key, value, needed = "stages[-1].unknowns", str(self.stages[-1].unknowns), "both"
-        if self.method == "geometric":
-            key, value, needed = "point_cloud.order", self.point_cloud.order, "joint"
-        if self.backward.mode != "none" and self.method == "box_alignment":
-            raise ConfigError(f"backward.mode: method box_alignment needs none, got {self.backward.mode}")
-        if self.backward.mode.startswith("implicit") and value != needed:
-            raise ConfigError(f"{key}: backward.mode {self.backward.mode} needs {needed}, got {value}")
+        if self.backward.mode.startswith("implicit") and self.stages[-1].unknowns != "both":
+            value = self.stages[-1].unknowns
+            raise ConfigError(f"stages[-1].unknowns: backward.mode {self.backward.mode} needs both, got {value}")
+
+    @property
+    def fits_images(self) -> bool:
+        """Whether silhouettes or the photometric term take part."""
+        return self.silhouette.weight > 0 or self.photometric.weight > 0
+
+    @property
+    def fits_points(self) -> bool:
+        """Whether the point cloud of dense stereo takes part."""
+        return self.point_cloud.weight > 0

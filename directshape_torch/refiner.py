@@ -56,7 +56,7 @@ class DirectShapeRefiner(nn.Module):
             submodule, so its tensors move with `.to(...)` and live in the `state_dict`.
         config: settings. Default: `RefinerConfig()`, which equals `configs/default.yaml`.
         extra_terms: factories of a user's own terms for the cars of a call (docs/extra_terms.md), in addition to the
-            terms of the method.
+            terms of the settings.
         rig: a `RigEstimate`, which lives in the `state_dict` too. It corrects frames that bring no disparity field of
             their own, and says how good the detector's depths and its own field are if frames and detections do not say
             it. Without a rig, cameras may be off by `config.rig.disparity_sigma_px`, and the detector is taken to be as
@@ -64,7 +64,7 @@ class DirectShapeRefiner(nn.Module):
 
     Raises:
         InputError: a prior without the members or derivatives that `ShapePrior` lists; settings that are no
-            `RefinerConfig`; extra terms for the method "box_alignment".
+            `RefinerConfig`.
 
     Examples:
         >>> refiner = DirectShapeRefiner()
@@ -89,8 +89,6 @@ class DirectShapeRefiner(nn.Module):
         self.extra_terms = tuple(extra_terms)
         self.rig = rig
         self._has_checked = self._has_warned = False
-        if self.extra_terms and self.config.method == "box_alignment":
-            raise InputError("extra_terms", "none with method box_alignment", f"{len(extra_terms)}", "choose direct")
         needs_graph = self.config.solver.jacobian == "autograd" or self.config.backward.mode != "none"
         if prior is not None or needs_graph:
             from directshape_torch.shape.check_prior import check_prior
@@ -154,11 +152,10 @@ class DirectShapeRefiner(nn.Module):
     def weighs_detector(self) -> bool:
         """Whether results are combined with the detector's boxes.
 
-        The errors of the images were measured with the method "direct" only. Standard deviations in the settings are a
-        prior of the energy, so the box must not count a second time.
+        Standard deviations in the settings are a prior of the energy, so the box must not count a second time.
         """
         priors = self.config.priors
-        return self.config.method == "direct" and priors.detector_weight > 0 and not any(priors.pose_sigmas)
+        return priors.detector_weight > 0 and not any(priors.pose_sigmas)
 
     @property
     def detector_sigmas(self) -> Tensor | None:
@@ -174,8 +171,8 @@ class DirectShapeRefiner(nn.Module):
     def _is_rig_unknown(self, frames: FrameBatch) -> bool:
         """Whether the camera error is unknown: frames have no disparity field and its sigma is not set to 0."""
         is_known = frames.camera.disparity_field is not None or self.config.rig.disparity_sigma_px == 0
-        # Points and boxes of the other methods have no unknown offset.
-        return not is_known and self.config.method == "direct"
+        # Points of stereo have no unknown offset.
+        return not is_known and not self.config.fits_points
 
     def _warn_of(self, frames: FrameBatch, detections: Detections) -> None:
         """Warn of mistakes that the tensors of this call show, as the setting `check` asks."""
@@ -224,7 +221,7 @@ class DirectShapeRefiner(nn.Module):
         if len(rows) == len(came):
             return self._minimise(problem, initial, cars, came)
         found = self._minimise(problem, initial, cars, came.rows(rows))
-        return replace(came.put(rows, found), term_names=found.term_names, has_shape=found.has_shape)
+        return replace(came.put(rows, found), term_names=found.term_names)
 
     @full_precision()
     def problem(
@@ -249,8 +246,8 @@ class DirectShapeRefiner(nn.Module):
         # Standard deviations of the settings take precedence over the rig's.
         if any(self.config.priors.pose_sigmas):
             informed = replace(informed, pose_sigma=detections.pose_sigma)
-        # Points and boxes of the other methods have no unknown offset.
-        if self.config.method != "direct":
+        # Points of stereo have no unknown offset.
+        if self.config.fits_points:
             informed = replace(informed, offset_sigma_px=detections.offset_sigma_px)
         return frames, informed
 
@@ -263,9 +260,9 @@ class DirectShapeRefiner(nn.Module):
         return CarState.of(se3.inverse(T_cam_obj), code, cars.num_offsets)
 
     def _observe(self, frames: FrameBatch, detections: Detections) -> Observation:
-        """What the images show of all cars, with stereo points for the methods that use them."""
+        """What the images show of all cars, with points of stereo where the settings fit them."""
         seen = pack_pixels(frames, detections, self.config.sampling)
-        if self.config.method in ("direct", "box_alignment"):
+        if not self.config.fits_points:
             return seen
         from directshape_torch.stereo_matching.disparity import with_disparity
         from directshape_torch.terms.car_points import car_points
@@ -276,10 +273,6 @@ class DirectShapeRefiner(nn.Module):
     def _minimise(
         self, problem: CarProblem, initial: CarState, cars: CarBatch, came: RefinementResult
     ) -> RefinementResult:
-        if self.config.method == "box_alignment":
-            from directshape_torch.refinement.box_alignment import align_boxes
-
-            return align_boxes(problem, initial, cars, came)
         if cars.track_id is None:
             return Refined.of(problem, cars, initial, initial, came).result(initial)
         # The import stands here, because only cars in tracks need it.

@@ -57,8 +57,8 @@ class FrameBatch(TensorRecord):
         camera: calibration of the frames.
         ground: a ground plane for each frame, in the left camera frame.
         frame_ids: a name for each frame.
-        disparity: (F, H, W) measured `u_left - u_right` of the left pixels, NaN where unknown, for the methods that fit
-            a point cloud; without it (None) they match the images themselves.
+        disparity: (F, H, W) measured `u_left - u_right` of the left pixels, NaN where unknown, for settings that fit
+            a point cloud; without it (None) the images are matched.
         points_cam: (F, P, 3) points of a LiDAR in the left camera frame, metres, NaN where a frame has fewer than P,
             for `terms.lidar`; None where there are none.
         time_s: (F,) when each frame was taken, seconds from any beginning that keeps them small; with `track_id` a car

@@ -51,6 +51,12 @@ THINNED = (
     # The weights of images and detector are constants of the derivatives.
     "priors.detector_weight=0",
 )
+_POINTS_ALONE = (
+    "silhouette.weight=0",
+    "photometric.weight=0",
+    "point_cloud.weight=300",
+    "point_cloud.min_points=20",
+)
 # These are the changes of the default settings for each row of the table.
 OPTIONS: dict[str, tuple[str, ...]] = {
     "default": (),
@@ -64,9 +70,12 @@ OPTIONS: dict[str, tuple[str, ...]] = {
         "stages=[{contour_width_px: 2.0, image_level: 1, max_iterations: 6}, {contour_width_px: 0.5, image_level: 0, "
         "max_iterations: 6}]",
     ),
-    "geometric": ("method=geometric", "point_cloud.min_points=20"),
-    "geometric joint": ("method=geometric", "point_cloud.order=joint", "point_cloud.min_points=20"),
-    "combined": ("method=combined", "point_cloud.min_points=20"),
+    "points alone, in turn": (
+        *_POINTS_ALONE,
+        f"stages=[{', '.join(['{max_iterations: 4, unknowns: pose}', '{max_iterations: 4, unknowns: shape}'] * 8)}]",
+    ),
+    "points alone": (*_POINTS_ALONE, "stages=[{max_iterations: 4}]"),
+    "points beside images": ("point_cloud.weight=30", "point_cloud.min_points=20"),
 }
 # These settings take undamped steps to the root of the gradient, on masks of few pixels.
 SETTLED = (
@@ -153,7 +162,7 @@ def refined(scene: Scene, config: RefinerConfig, by: Mapping[str, Tensor]) -> Re
     prior.mean = prior.mean + at["prior mean"]
     prior.basis = prior.basis * (1 + at["prior basis"])
     refiner = DirectShapeRefiner(prior, config)
-    weighted = "point_cloud" if config.method == "geometric" else "silhouette_left"
+    weighted = "silhouette_left" if config.fits_images else "point_cloud"
     return refiner(frames, detections, {weighted: (1 + at["term weight"]).expand(len(d))})
 
 

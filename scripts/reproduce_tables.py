@@ -4,10 +4,10 @@
     python scripts/reproduce_tables.py pose --data $R --detections $R/detections/stereo --masks $R/training/masks
     python scripts/reproduce_tables.py ablation --data $R --detections $R/detections/stereo --masks $R/training/masks
 
-A row is a call of `directshape refine` with the words beside its name below, in its own folder under --out. A second
-call only makes the table, and an interrupted call continues. Other data, detections or masks need another --out. A
-difference in the ablation is the mean change of BEV IoU from the default, of the same cars, with its 95 % interval over
-cars.
+A row is a call of `directshape refine` with the words beside its name below, or of `align_boxes.py`, in its own folder
+under --out. A second call only makes the table, and an interrupted call continues. Other data, detections or masks need
+another --out. A difference in the ablation is the mean change of BEV IoU from the default, of the same cars, with its
+95 % interval over cars.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import align_boxes
 import numpy as np
 from command_line import run_command
 
@@ -28,16 +29,18 @@ from directshape_torch.evaluation.bootstrap import CarBootstrap
 from directshape_torch.evaluation.comparison import Comparison, compare_results
 from directshape_torch.evaluation.kitti_ap import evaluate_kitti
 from directshape_torch.evaluation.tables import number, with_interval
+from directshape_torch.rig.rig_file import RIG_FILE
 
 DEFAULT = "default"
+BOX_ALIGNMENT = "box alignment"
 METHODS = {
     DEFAULT: "",
     "input where not trusted": "--trusted",
     "paper": "--config paper",
     "fast": "--config fast",
-    "geometric": "--method geometric",
-    "combined": "--method combined",
-    "box alignment": "--method box_alignment",
+    "geometric": "--config geometric",
+    "combined": "--config combined",
+    BOX_ALIGNMENT: "align_boxes.py",
 }
 _COARSE = "{contour_width_px: 2.0, image_level: 1, max_iterations: 6, over_relaxation: 1.6, unknowns: pose}"
 _FINE = "{contour_width_px: 0.5, image_level: 0, max_iterations: 6, over_relaxation: 1.6, unknowns: pose}"
@@ -97,10 +100,14 @@ def refined(args: argparse.Namespace, name: str) -> Path:
     rows, out = TABLES[args.table], folder_of(args, name)
     if name not in rows:
         raise InputError("--rows", f"names among {', '.join(rows)}", name)
-    words = ["refine", "--data", args.data, "--detections", args.detections, "--masks", args.masks, "--out", out]
-    words += [] if args.frames is None else ["--frames", *args.frames]
+    data = ["--data", args.data, "--detections", args.detections, "--masks", args.masks, "--out", out]
+    words = [*map(str, data), *([] if args.frames is None else ["--frames", *args.frames])]
     with contextlib.redirect_stdout(sys.stderr):
-        code = directshape([*map(str, words), *words_of(rows[name])])
+        if name == BOX_ALIGNMENT:
+            # The rig is the one that the default has estimated from the same frames.
+            code = align_boxes.main([*words, "--rig", str(folder_of(args, DEFAULT) / RIG_FILE)])
+        else:
+            code = directshape(["refine", *words, *words_of(rows[name])])
     if code:
         raise DirectShapeError(f"the row {name!r} could not be refined, see above")
     return out
@@ -128,9 +135,8 @@ HEAD = ("", "BEV IoU, mean", "3D IoU, mean", "worse", "against default",
 
 def comparison(args: argparse.Namespace, name: str) -> Comparison:
     """A row's boxes compared with the labels, over the cars that have a mask."""
-    out = refined(args, name)
-    labels = args.data / "training" / "label_2"
-    return compare_results(labels, args.detections, out / "data", frames=args.frames, shapes_dir=out / "shapes")
+    out, labels, with_masks = refined(args, name), args.data / "training" / "label_2", folder_of(args, DEFAULT)
+    return compare_results(labels, args.detections, out / "data", frames=args.frames, shapes_dir=with_masks)
 
 
 def box_cells(found: Comparison, when: str) -> list[str]:

@@ -44,7 +44,9 @@ def test_every_file_has_a_name_and_is_part_of_the_package() -> None:
     assert sorted(path.stem for path in folder.glob("*.yaml")) == sorted(BUNDLED_CONFIGS)
     # One place only: the folder at the top is a link.
     assert CONFIGS.resolve() == folder.resolve()
-    with pytest.raises(ConfigError, match=r"papr: cannot be read .* bundled ones are default, paper, fast"):
+    with pytest.raises(
+        ConfigError, match=r"papr: cannot be read .* bundled ones are default, paper, fast, geom.*, combined"
+    ):
         load_config("papr")
 
 
@@ -82,7 +84,7 @@ def test_paper_anneals_the_contour_by_a_factor_of_07() -> None:
 
 def test_paper_names_an_option_that_exists_for_each_deviation() -> None:
     text = (CONFIGS / "paper.yaml").read_text(encoding="utf-8")
-    header = text[: text.index("\nmethod:")]
+    header = text[: text.index("\ncompile:")]
     known = keys(config_to_mapping(RefinerConfig()))
     named = set(re.findall(r"\b(?:photometric|silhouette|sampling|solver|priors)\.(?!md)[a-z_]+(?:\*)?", header))
     assert len(named) >= 6

@@ -70,7 +70,7 @@ def test_a_prior_of_ones_own_counts_like_ours() -> None:
     torch.testing.assert_close(lower, torch.full((2,), 0.1).double(), rtol=0, atol=0.04)
 
 
-def test_points_of_a_lidar_beside_the_images_are_the_combined_method() -> None:
+def test_points_of_a_lidar_count_like_those_of_stereo() -> None:
     prior, scene = measured_street()
     detections = disturbed(scene.detections, 0.25, 0.08)
     cloud = PointCloudConfig(weight=1000.0, min_points=50)
@@ -79,9 +79,7 @@ def test_points_of_a_lidar_beside_the_images_are_the_combined_method() -> None:
         return PointCloud.of_points(cloud, car_points(frames, detections, cloud), "lidar")
 
     extra = DirectShapeRefiner(prior, DEFAULT, [lidar])(scene.frames, detections)
-    combined = DirectShapeRefiner(
-        prior, replace(DEFAULT, method="combined", point_cloud=replace(cloud, weight=10_000.0))
-    )
+    combined = DirectShapeRefiner(prior, replace(DEFAULT, point_cloud=cloud))
     torch.testing.assert_close(extra.T_cam_obj, combined(scene.frames, detections).T_cam_obj, rtol=0, atol=1e-9)
 
 

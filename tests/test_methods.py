@@ -8,22 +8,23 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.problems import DEFAULT
+from helpers.problems import DEFAULT, GEOMETRIC
 from helpers.synthetic_scene import disturbed, joined_detections, joined_frames, masked, measured_street, select
 from torch import Tensor
 
-from directshape_torch.config import PointCloudConfig, RefinerConfig
+from directshape_torch.config import PointCloudConfig, RefinerConfig, StageConfig
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.status import Status
 
 WEAK = replace(DEFAULT.priors, shape_weight=0.01, dimensions_weight=0.0)
-CLOUD = PointCloudConfig(weight=1000.0, min_points=50, rounds=12)
-GEOMETRIC = replace(DEFAULT, method="geometric", point_cloud=CLOUD, priors=WEAK)
-JOINT = replace(GEOMETRIC, point_cloud=replace(CLOUD, order="joint", max_iterations=60))
-COMBINED = replace(DEFAULT, method="combined", point_cloud=replace(CLOUD, weight=10_000.0))
-CONFIGS = {"alternating": GEOMETRIC, "joint": JOINT, "combined": COMBINED}
+CLOUD = PointCloudConfig(weight=1000.0, min_points=50)
+ROUND = GEOMETRIC.stages[:2]
+ALTERNATING = replace(GEOMETRIC, point_cloud=CLOUD, priors=WEAK, stages=12 * ROUND)
+JOINT = replace(ALTERNATING, stages=(StageConfig(max_iterations=60),))
+COMBINED = replace(DEFAULT, point_cloud=CLOUD)
+CONFIGS = {"alternating": ALTERNATING, "joint": JOINT, "combined": COMBINED}
 
 
 def scene_of(frames: FrameBatch | None = None) -> tuple[FrameBatch, Detections]:
@@ -62,9 +63,7 @@ def test_exact_points_lead_to_the_truth(method: str) -> None:
 def test_alternating_creeps_to_where_the_joint_refinement_jumps() -> None:
     """Of one cost: where length and depth trade, alternating steps are small, and more rounds only lower the cost."""
     exact = replace(DEFAULT.solver, cost_tolerance=1e-12, step_tolerance=1e-9)
-    rounds = [
-        refine(replace(GEOMETRIC, solver=exact, point_cloud=replace(CLOUD, rounds=n)), *scene_of()) for n in (1, 4, 16)
-    ]
+    rounds = [refine(replace(ALTERNATING, solver=exact, stages=n * ROUND), *scene_of()) for n in (1, 4, 16)]
     joint = refine(replace(JOINT, solver=exact), *scene_of())
     first, fourth, last = (result.cost_after.sum(1) for result in rounds)
     assert (last < fourth).all()
@@ -100,7 +99,7 @@ def _hide(frames: FrameBatch, mask: Tensor, left_over: int) -> FrameBatch:
 def test_too_few_points_are_a_status_and_touch_no_other_car() -> None:
     frames, detections = scene_of()
     healthy = refined("alternating")
-    result = refine(GEOMETRIC, _hide(frames, detections.mask_left[1], CLOUD.min_points - 1), detections)
+    result = refine(ALTERNATING, _hide(frames, detections.mask_left[1], CLOUD.min_points - 1), detections)
     assert result.status[1] is Status.too_few_points
     assert "point_cloud.min_points" in result.status[1].value
     assert torch.equal(result.T_cam_obj[1], detections.T_cam_obj[1])
@@ -122,24 +121,24 @@ def test_no_mask_is_no_obstacle_for_the_point_cloud() -> None:
     frames, detections = scene_of()
     absent = torch.zeros_like(detections.has_mask_left)
     bare = masked(detections, absent, absent)
-    assert all(status.is_refined for status in refine(GEOMETRIC, frames, bare).status)
+    assert all(status.is_refined for status in refine(ALTERNATING, frames, bare).status)
     assert refine(COMBINED, frames, bare).status == [Status.no_mask] * 2
 
 
 def test_no_cars_and_cars_behind_the_camera() -> None:
     frames, detections = scene_of()
-    assert len(refine(GEOMETRIC, frames, select(detections, torch.arange(0)))) == 0
+    assert len(refine(ALTERNATING, frames, select(detections, torch.arange(0)))) == 0
     T_cam_obj = detections.T_cam_obj.clone()
     T_cam_obj[0, 2, 3] *= -1
     T_cam_obj[1] = torch.nan
-    result = refine(GEOMETRIC, frames, replace(detections, T_cam_obj=T_cam_obj))
+    result = refine(ALTERNATING, frames, replace(detections, T_cam_obj=T_cam_obj))
     assert result.status == [Status.behind_camera, Status.non_finite]
 
 
 def test_without_a_map_the_images_are_matched() -> None:
     scene = measured_street()[1]
     detections = disturbed(scene.detections, 0.25, 0.08)
-    result = refine(GEOMETRIC, replace(scene.frames, disparity=None), detections)
+    result = refine(ALTERNATING, replace(scene.frames, disparity=None), detections)
     assert all(status.is_refined for status in result.status)
     # Of the near car: at 12.5 m the disparity is 6 px here, and a tenth of a pixel is 0.2 m.
     assert centre_errors(result.T_cam_obj)[0] < 0.5 * centre_errors(detections.T_cam_obj)[0]

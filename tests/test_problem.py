@@ -12,10 +12,10 @@ import pytest
 import torch
 from helpers.derivatives import moved
 from helpers.five_cars import five_cars, step_of
-from helpers.problems import DEFAULT, MARCHED, PAPER, figures_at, left_of
+from helpers.problems import DEFAULT, GEOMETRIC, MARCHED, PAPER, figures_at, left_of
 from helpers.problems import begun_stage as begun_at
 from helpers.synthetic_scene import cached_street, disturbed, select
-from helpers.term_cases import CLOUD, COMBINED, case
+from helpers.term_cases import COMBINED, case
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig, StageConfig
@@ -23,7 +23,7 @@ from directshape_torch.errors import ConfigError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.stereo_dataset import open_dataset
-from directshape_torch.refinement.problem import CarProblem, CarStage, method_stages
+from directshape_torch.refinement.problem import CarProblem, CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -214,7 +214,7 @@ def _names(config: RefinerConfig) -> tuple[str, ...]:
     )
 
 
-def test_methods_are_lists_of_terms_and_terms_of_weight_zero_are_left_out() -> None:
+def test_terms_are_those_with_a_weight() -> None:
     images, priors = ("silhouette_left", "silhouette_right", "photometric"), ("shape", "height", "tilt", "dimensions")
     assert _names(DEFAULT) == (*images, *priors)
     assert _names(PAPER) == (*images, *priors[:3])
@@ -223,13 +223,9 @@ def test_methods_are_lists_of_terms_and_terms_of_weight_zero_are_left_out() -> N
     assert "photometric" not in _names(replace(DEFAULT, photometric=replace(DEFAULT.photometric, weight=0.0)))
 
 
-def test_stages_of_the_geometric_method_alternate() -> None:
-    geometric = replace(DEFAULT, method="geometric", point_cloud=CLOUD)
-    assert [stage.unknowns for stage in method_stages(geometric)[:3]] == ["pose", "shape", "pose"]
-    joint = replace(geometric, point_cloud=replace(CLOUD, order="joint"))
-    assert [stage.unknowns for stage in method_stages(joint)] == ["both"]
-    with pytest.raises(ConfigError, match=r"point_cloud\.order: backward\.mode implicit needs joint, got alternating"):
-        replace(geometric, backward=replace(DEFAULT.backward, mode="implicit"))
+def test_implicit_gradients_need_a_last_stage_that_moves_everything() -> None:
+    with pytest.raises(ConfigError, match=r"stages\[-1\]\.unknowns: backward\.mode implicit needs both, got shape"):
+        replace(GEOMETRIC, backward=replace(DEFAULT.backward, mode="implicit"))
 
 
 # The rig's residual disparity

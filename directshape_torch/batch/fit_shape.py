@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.config import RefinerConfig, RigConfig
+from directshape_torch.config import PointCloudConfig, RefinerConfig, RigConfig
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses, is_z_up
 from directshape_torch.geometry.stereo_camera import StereoCamera
@@ -34,6 +34,8 @@ _CAMERA_HEIGHT_M, _DISTANCE_M = 1.65, 10.0
 _BEYOND_BOX_M = 0.4
 _LEAST_HEIGHT_M = 0.15
 _LEAST_POINTS, _MOST_POINTS = 30, 1000
+# This is the weight of the points of a car against the priors, per square metre.
+_WEIGHT = 300.0
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,7 @@ def _fitter(prior: ShapePrior | None, samples: PointSamples) -> DirectShapeRefin
         photometric=replace(plain.photometric, weight=0.0),
         priors=replace(plain.priors, detector_weight=0.0),
     )
-    of_points = replace(plain.point_cloud, min_points=_LEAST_POINTS)
+    of_points = PointCloudConfig(weight=_WEIGHT, min_points=_LEAST_POINTS)
 
     def point_term(_: FrameBatch, __: Detections, cars: CarBatch, ___: ShapePrior) -> PointCloud:
         is_kept = torch.zeros_like(samples.counts, dtype=torch.bool).index_fill(0, cars.detection_row, True)

@@ -37,7 +37,7 @@ from directshape_torch.visualize.car_figures import (
 from directshape_torch.visualize.drawing import Picture, View, draw_box, draw_contour, titled, write_gif
 from directshape_torch.visualize.drawn_car import DrawnCar, drawn_cars
 from directshape_torch.visualize.overlay import overlay_of_frame
-from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement, without_photometry
+from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement, without_depth
 
 _SIZE_PX = (480, 334)
 _SECONDS_A_FRAME, _SECONDS_AT_END = 0.4, 2.5
@@ -137,9 +137,9 @@ def inspect_frame(
 def silhouette_trace(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> RefinementTrace | None:
     """The trace of a refinement by silhouettes and priors, or None if the refiner lacks one of the paper's terms."""
     config = refiner.config
-    if config.method != "direct" or not (config.photometric.weight > 0 and config.silhouette.weight > 0):
+    if not (config.photometric.weight > 0 and config.silhouette.weight > 0):
         return None
-    return trace_refinement(without_photometry(refiner), loaded.frame, loaded.detections)
+    return trace_refinement(without_depth(refiner), loaded.frame, loaded.detections)
 
 
 def _report(loaded: LoadedFrame, trace: RefinementTrace, rows: Sequence[int], must_refine: bool) -> None:

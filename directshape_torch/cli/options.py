@@ -15,7 +15,7 @@ import torch
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.io.config_files import load_config
+from directshape_torch.io.config_files import BUNDLED_CONFIGS, load_config
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.mask_files import CocoFileMasks
 from directshape_torch.io.run_folder import RunFolder
@@ -49,7 +49,7 @@ def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = T
             "--disparity",
             type=Path,
             metavar="DIR",
-            help="disparity maps NNNNNN.png of any stereo method (KITTI's 16 bits), for --method geometric or combined",
+            help="disparity maps NNNNNN.png of any stereo method (KITTI's 16 bits), for --config geometric or combined",
         )
     group.add_argument(
         "--ground",
@@ -101,7 +101,9 @@ def add_lidar_option(group: argparse._ActionsContainer) -> None:
 def add_config_option(group: argparse._ActionsContainer) -> None:
     """Add `--config`, whose value stays text, since ./paper is a file but paper the bundled settings."""
     group.add_argument(
-        "--config", metavar="FILE|NAME", help="settings of the refinement (YAML), or default, paper or fast"
+        "--config",
+        metavar="FILE|NAME",
+        help=f"settings of the refinement (YAML), or one of {', '.join(BUNDLED_CONFIGS)}",
     )
 
 

@@ -77,12 +77,6 @@ def _add_outputs(group: argparse._ArgumentGroup) -> None:
 
 def _add_settings(group: argparse._ArgumentGroup) -> None:
     add_refiner_options(group)
-    group.add_argument(
-        "--method",
-        choices=("direct", "geometric", "combined", "box_alignment"),
-        help="images (default), the stereo point cloud (Engelmann et al., GCPR 2016), both, or boxes aligned in "
-        "depth alone (Stereo R-CNN)",
-    )
     add_device_option(group)
     group.add_argument(
         "--batch-frames", type=int, metavar="N", help=f"frames in one call (default: 1, of tracks {_TRACK_FRAMES})"
@@ -109,15 +103,14 @@ def run(args: argparse.Namespace) -> int:
     default_frames = _TRACK_FRAMES if args.tracks else 1
     batch_frames = default_frames if args.batch_frames is None else args.batch_frames
     options = RefineOptions(args.meshes, args.overlays, batch_frames, args.workers, args.threads, args.retries)
-    chosen = [] if args.method is None else [f"method={args.method}"]
     extra = [] if args.lidar is None else [LidarPoints()]
     exact = ["rig.disparity_sigma_px=0"] if args.rig == "none" else []
-    settings = [*exact, *args.set, *chosen]
+    settings = [*exact, *args.set]
     # The data set is checked below, so the calls need no check.
     refiner = make_refiner(args.config, [*settings, "check=off"], args.prior, args.device, extra)
-    if args.disparity is not None and refiner.config.method in ("direct", "box_alignment"):
+    if args.disparity is not None and not refiner.config.fits_points:
         raise InputError(
-            "--disparity", "a method that uses it", refiner.config.method, "add --method geometric or combined"
+            "--disparity", "settings that fit points", "point_cloud.weight 0", "add --config geometric or combined"
         )
     dataset = dataset_of(args)
     check_out_dir(dataset, args.out)
@@ -127,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
     if rigs:
         dataset = replace(dataset, disparity_fields=tuple(rig.field for rig in rigs))
         refiner.rig = RigEstimates(rigs)
-        if refiner.config.method == "direct":
+        if not refiner.config.fits_points:
             _say_where_rigs_are_guesses(rigs)
         if refiner.weighs_detector:
             with limited_threads(options.threads):

@@ -142,7 +142,7 @@ class PaintedFrame:
     def stereo_points(self) -> dict[int, tuple[Points, NDArray[np.uint8]]]:
         """Points (N, 3), metres, and colours (N, 3) of dense stereo on each car, by its line number.
 
-        They are selected as for the point cloud methods of the refinement, after the rig's known bias is subtracted.
+        They are selected as for a refinement that fits a point cloud, after the rig's known bias is subtracted.
         """
         if self.loaded is None or self.view is None:
             return {}

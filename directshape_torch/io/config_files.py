@@ -15,9 +15,17 @@ from directshape_torch.config import RefinerConfig, Settings
 from directshape_torch.errors import ConfigError, shown
 from directshape_torch.files.read_files import read_text
 
-BUNDLED_CONFIGS = ("default", "paper", "fast")
+BUNDLED_CONFIGS = ("default", "paper", "fast", "geometric", "combined")
 """These are the names of the settings that come with the package, for `load_config`."""
 
+# Each of these keys of earlier versions has something else in its place.
+_ALTERNATION = "each round is two entries of stages, as in the settings geometric"
+_GONE = {
+    "method": "choose --config geometric or combined, or give silhouette, photometric and point_cloud their weights",
+    "point_cloud.order": _ALTERNATION,
+    "point_cloud.rounds": _ALTERNATION,
+    "point_cloud.max_iterations": _ALTERNATION,
+}
 # The YAML parser takes a second for ten thousand lines.
 _MOST_BYTES = 2**20
 _CONFIG_FOLDER = Path(__file__).parents[1] / "assets" / "configs"
@@ -53,7 +61,8 @@ def _from_mapping(cls: type[_GroupT], mapping: Mapping[str, Any], where: str, kn
     hints = cls.types()
     for key in mapping:
         if key not in hints:
-            raise ConfigError(f"unknown key {where}{key!s}; {_other_keys(str(key), where, list(hints), known)}")
+            cure = _GONE.get(f"{where}{key}") or _other_keys(str(key), where, list(hints), known)
+            raise ConfigError(f"unknown key {where}{key!s}; {cure}")
     values = {key: _convert(hints[key], value, f"{where}{key}", known) for key, value in mapping.items()}
     try:
         return cls(**values)
@@ -124,8 +133,8 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -
     """Read a YAML file and apply `key.sub=value` overrides (values in YAML).
 
     Args:
-        path: the file, or the name of bundled settings: "default", "paper" or "fast". None gives the defaults. A file
-            with such a name in the working folder is given as "./paper".
+        path: the file, or the name of bundled settings (`BUNDLED_CONFIGS`). None gives the defaults. A file with such a
+            name in the working folder is given as "./paper".
         overrides: for example `["silhouette.weight=6", "solver.max_code=2.5"]`.
 
     Raises:

@@ -124,8 +124,8 @@ def open_dataset(
             comes first, because plane files have the bias of the disparities that they were made from.
         camera_height_m: height of the camera above a level ground, if no plane is found.
         disparity_field: residual disparity of the rig, or of several rigs, or None.
-        disparity_dir: folder of `NNNNNN.png` (or `NNNNNN_10.png`) with disparity maps of any stereo method, for methods
-            that fit a point cloud. None means that these methods match the images themselves.
+        disparity_dir: folder of `NNNNNN.png` (or `NNNNNN_10.png`) with disparity maps of any stereo method, for
+            settings that fit a point cloud. None means that the images are matched.
         lidar_dir: folder of KITTI's LiDAR scans `NNNNNN.bin`, whose pose is in the calibration of the frames. None
             means frames without points.
         tracks: whether to number the cars over the frames of a sequence (`Detections.track_id`): by the detection

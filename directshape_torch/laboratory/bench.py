@@ -10,6 +10,7 @@ from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.geometry import se3
+from directshape_torch.io.config_files import load_config
 from directshape_torch.laboratory.regimes import Draw, Regime, seeded
 from directshape_torch.laboratory.scenes import LaboratoryScene
 from directshape_torch.numerics.tensors import length, occurrences
@@ -132,7 +133,7 @@ def rows_at(term: Term, sight: Sight) -> Linear:
 
 def _settings(regime: Regime, pixels_per_car: int) -> RefinerConfig:
     """The default settings with every prior and few pixels."""
-    config = RefinerConfig(method="combined")
+    config = load_config("combined")
     # These are a stereo detector's standard deviations. Without them there would be no pose prior to examine.
     priors = replace(
         config.priors,

@@ -32,7 +32,7 @@ class Observation:
     # what hides cars in the right image, by row of the detections; None where it is not asked for
     hidden_right: OcclusionMap | None
     mask_areas: Tensor  # (detections of the call, 2) foreground pixels of the left and right masks, 0 where absent
-    points: PointSamples | None = None  # points of dense stereo, for the methods that use them
+    points: PointSamples | None = None  # points of dense stereo where a term fits them
 
     def of_objects(self, keep: Tensor) -> Observation:
         """The observation of the objects where `keep` (B,) holds; occlusion and areas still cover all detections."""

@@ -114,7 +114,7 @@ def refusals(frames: FrameBatch, detections: Detections, seen: Observation, conf
     finite = T.isfinite().all(-1).all(-1)
     upright = (T[:, :3, 1] * frames.ground.normal[detections.frame_index]).sum(-1) < 0
     in_front = finite & (T[:, 2, 3] > _MIN_DEPTH_M) & upright
-    if config.method == "geometric" and seen.points is not None:
+    if seen.points is not None and not config.fits_images:
         lacking = [(seen.points.counts < config.point_cloud.min_points, Status.too_few_points)]
     else:
         lacking = _lacking_pixels(seen, config.sampling.min_usable_pixels)

@@ -63,8 +63,8 @@ class CarProblem:
         """Names of the T columns of costs."""
         return tuple(name for each in (*self.evidence, *self.extra_terms) for name in each.names)
 
-    def stages(self) -> list[StageConfig]:
-        return method_stages(self.config)
+    def stages(self) -> tuple[StageConfig, ...]:
+        return self.config.stages
 
     def parts(
         self, terms: tuple[Term, ...], field: Field, state: State, wheres: tuple[Where, ...], fisher: bool = True
@@ -346,17 +346,3 @@ class CarIterations:
         cost, gradient, hessian = (x.index_select(0, index) for x in at[:3])
         iterations = CarIterations.of(self.stage, terms, rest, factors, masks, self.sharing.of_problems(numbers))
         return iterations, Evaluation(cost, gradient, hessian, tuple(map(kept, self.terms, at.wheres)))
-
-
-def method_stages(config: RefinerConfig) -> list[StageConfig]:
-    """Stages of `config.method`: "geometric" has its own rounds, other methods have the configured stages."""
-    if config.method != "geometric":
-        return list(config.stages)
-    # Contour and pyramid level do not affect a point cloud. The values of the last stage are taken, for pictures and
-    # measurements.
-    last, cloud = config.stages[-1], config.point_cloud
-    pose_stage, shape_stage, joint_stage = (
-        StageConfig(last.contour_width_px, last.image_level, cloud.max_iterations, unknowns=unknowns)
-        for unknowns in ("pose", "shape", "both")
-    )
-    return [pose_stage, shape_stage] * cloud.rounds if cloud.order == "alternating" else [joint_stage]

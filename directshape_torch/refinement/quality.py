@@ -33,7 +33,7 @@ class FitQuality(CarRecord):
         matched_share: (B,) share of the photometric pixel set that could be compared at the end.
         evidence: (B, E) evidence that the car is there at all, columns `trust.EVIDENCE_NAMES`.
         probability_better: (B,) calibrated probability that the returned box overlaps the true one more than the
-            input does, seen from above; NaN for all methods but "direct".
+            input does, seen from above; NaN unless silhouettes and photometry are fitted, without a point cloud.
         probability_not_worse: (B,) calibrated probability that the overlap of the returned box is at least the input's
             overlap minus 0.05. For cars with status `not_trusted` or `no_car` all figures belong to the refinement that
             was not returned.
@@ -77,7 +77,7 @@ def fit_quality(
         [(halves_apart + 0.02).log(), misfit.clamp_min(0.01).log(), (distance_in_sigmas**2 + 3).log()], dim=1
     ).to(torch.float64)
     is_there = bundled_trust_model().car_is_there(evidence)
-    # The figures were measured with the terms of the method "direct".
+    # The figures were measured with these terms.
     names = stage.problem.term_names
     if not {"silhouette_left", "photometric"} <= set(names) or "point_cloud" in names:
         is_there = torch.full_like(is_there, torch.nan)

@@ -94,8 +94,6 @@ class RefinementResult(CarRecord):
         track_part: (B,) int64, 0 for cars that share their shape with other views of their track. If a track was split,
             because its views cannot show one car, this is the number of the part. It is -1 for shapes of one view.
         prior: the family of shapes.
-        has_shape: whether the shape was refined, so that boxes are measured on it; False for the method
-            "box_alignment".
 
     Examples:
         >>> import pathlib
@@ -130,7 +128,6 @@ class RefinementResult(CarRecord):
     t_cam_ref: Annotated[Tensor, Dense("B", 3)]
     track_part: Annotated[Tensor, Dense("B", kind="index")]
     prior: ShapePrior
-    has_shape: bool = True
 
     def __len__(self) -> int:
         return len(self.T_cam_obj)
@@ -260,8 +257,7 @@ class RefinementResult(CarRecord):
     def boxes(self) -> KittiBoxes:
         """KITTI boxes of the refined zero level, with sub-voxel precision.
 
-        Cars that were not refined have the detector's box. Boxes from the method "box_alignment" have the detector's
-        dimensions.
+        Cars that were not refined have the detector's box.
 
         The location is `T_ref_obj` of the level's bottom centre (mid x, max y, mid z), not the object origin.
         """
@@ -303,8 +299,8 @@ class RefinementResult(CarRecord):
         if frame not in ("ref", "cam"):
             raise InputError("frame", "'cam' or 'ref'", repr(frame))
         T = self.T_ref_obj if frame == "ref" else self.T_cam_obj
-        # A car whose shape was not refined keeps the detector's dimensions, not the mean shape's.
-        rows = (self.refined & self.has_shape).nonzero()[:, 0]
+        # A car that was not refined keeps the detector's dimensions, not the mean shape's.
+        rows = self.refined.nonzero()[:, 0]
         bottom, hwl = level_boxes(self.prior, T[rows], self.code[rows])
         dimensions = self.input_dimensions_hwl.index_copy(0, rows, hwl)
         location = T[:, :3, 3].index_copy(0, rows, bottom)
@@ -314,10 +310,10 @@ class RefinementResult(CarRecord):
     def sigma_xyz_yaw(self) -> Tensor:
         """Standard deviations (B, 4) of the box's place in `ref` and of its heading, metres and radians.
 
-        They are NaN for cars that were not refined, and for boxes of the method "box_alignment". They are scales of
-        Student's t of 4 degrees of freedom, fitted to cars with labels (docs/results.md), within which 63 % of the
-        errors lie. They include a rig's own disparity error as far as the covariance of its field,
-        `rig.disparity_sigma_px` or `Detections.offset_sigma_px` describes it.
+        They are NaN for cars that were not refined. They are scales of Student's t of 4 degrees of freedom, fitted to
+        cars with labels (docs/results.md), within which 63 % of the errors lie. They include a rig's own disparity
+        error as far as the covariance of its field, `rig.disparity_sigma_px` or `Detections.offset_sigma_px` describes
+        it.
         """
         return self.covariance_xyz_yaw.diagonal(dim1=1, dim2=2).sqrt()
 
@@ -374,9 +370,7 @@ def _check_state(result: RefinementResult) -> None:
 def _check_refined(result: RefinementResult) -> None:
     """Raise `InputError` unless refined cars have finite figures, as results of the refiner do."""
     boxes = result.boxes()
-    figures = (result.code, result.cost_after, *vars(boxes).values())
-    if result.has_shape:
-        figures += result.covariance, result.sigma_xyz_yaw
+    figures = (result.code, result.cost_after, *vars(boxes).values(), result.covariance, result.sigma_xyz_yaw)
     finite = torch.stack([x[:, None].isfinite().flatten(1).all(dim=1) for x in figures]).all(dim=0)
     wrong = (result.refined & ~finite).nonzero().flatten().tolist()
     if wrong:

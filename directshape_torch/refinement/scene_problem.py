@@ -1,4 +1,4 @@
-"""This module makes the problem of a call from the terms of its method, the images and a user's own terms."""
+"""This module makes the problem of a call from the images, the terms that have a weight and a user's own terms."""
 
 from __future__ import annotations
 
@@ -30,10 +30,7 @@ from directshape_torch.terms.priors import prior_terms
 from directshape_torch.terms.silhouette import MaskRows, SilhouetteEvidence
 from directshape_torch.terms.term import Evidence, Term
 
-# The weight of "point_cloud" holds for the methods with points. The first two hold for the methods with images.
 _WEIGHTS = "silhouette.weight, photometric.weight, point_cloud.weight, priors.*_weight"
-# If images take part, the weight of points is divided by this number, which gave the best results.
-_BESIDE_IMAGES = 10
 
 TermFactory: TypeAlias = Callable[[FrameBatch, Detections, CarBatch, ShapePrior], Term]
 """It makes a user's term for some cars of a call from the frames, all detections, the cars to refine and the prior."""
@@ -49,7 +46,7 @@ def problem_of_scene(
     extra_terms: Sequence[TermFactory] = (),
     term_weights: Mapping[str, Tensor] | None = None,
 ) -> CarProblem:
-    """Make the problem of `config.method`; terms of weight zero are left out, so that ablations cost nothing.
+    """Make the problem of the terms with a weight; terms of weight zero are left out, so that they cost nothing.
 
     The B cars are the rows `cars.detection_row` of the detections and of `term_weights`. `observation` is what the
     images show of them.
@@ -63,20 +60,18 @@ def problem_of_scene(
     sides = [Rows.of_sorted(p.object_index, len(cars)) for p in pixels]
     masks = MaskRows.of_pixels(pixels, sides, config.silhouette, len(cars))
     evidence: list[Evidence] = []
-    if observation.points is not None:
-        cloud = config.point_cloud
-        cloud = cloud if config.method == "geometric" else replace(cloud, weight=cloud.weight / _BESIDE_IMAGES)
-        evidence += [PointCloud.of_points(cloud, observation.points)] if cloud.weight > 0 else []
-    if config.method in ("direct", "combined") and config.silhouette.weight > 0:
+    if observation.points is not None and config.point_cloud.weight > 0:
+        evidence.append(PointCloud.of_points(config.point_cloud, observation.points))
+    if config.silhouette.weight > 0:
         evidence.append(SilhouetteEvidence(config.silhouette, cars, masks, prior.bounds_obj))
-    if config.method != "geometric" and config.photometric.weight > 0:
+    if config.photometric.weight > 0:
         pyramid = _pyramid(frames, max(stage.image_level for stage in config.stages))
         left = LeftPixels.of(pixels[0], sides[0], pyramid, observation.hidden_right, detections.mask_left)
         evidence.append(PhotometricEvidence(config.photometric, cars, left))
-    evidence += [] if config.method == "box_alignment" else prior_terms(config.priors, prior, cars)
+    evidence += prior_terms(config.priors, prior, cars)
     extra = [_made(make, frames, detections, cars, prior) for make in extra_terms]
     if not evidence and not extra:
-        raise ConfigError(f"method {config.method}: expected a term of weight above 0, got none: {_WEIGHTS}")
+        raise ConfigError(f"expected a term of weight above 0, got none: {_WEIGHTS}")
     problem = CarProblem(prior, tuple(evidence), tuple(extra), masks, masks.of_sides(), config)
     _check_extra(problem, cars)
     factors = _factors(term_weights, problem.term_names, prior.initial_code(len(detections)).to(frames.images_left))

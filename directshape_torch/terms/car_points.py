@@ -1,4 +1,4 @@
-"""This module selects the stereo points of each car, which the geometric method fits (Engelmann et al., GCPR 2016)."""
+"""This module selects the stereo points of each car, which a point cloud term fits (Engelmann et al., GCPR 2016)."""
 
 from __future__ import annotations
 

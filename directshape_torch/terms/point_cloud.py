@@ -2,7 +2,7 @@
 
 The cost `lambda / P sum_p Huber(sdf(T_obj_cam X_p))` is a mean over the points. The residual of a point on the surface
 is zero. A point is fixed in the camera frame; the state moves it in the object frame. The points may come from dense
-stereo (the methods "geometric" and "combined") or from a LiDAR. The derivation is in docs/derivations/point_cloud.md.
+stereo (the presets "geometric" and "combined") or from a LiDAR. The derivation is in docs/derivations/point_cloud.md.
 """
 
 from __future__ import annotations

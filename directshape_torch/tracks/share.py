@@ -8,11 +8,13 @@ refined together again.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from directshape_torch.config import StageConfig
 from directshape_torch.errors import InputError
 from directshape_torch.refinement.outcome import at_states, going_on, of_views_of_tracks
 from directshape_torch.refinement.problem import CarProblem
@@ -199,6 +201,13 @@ def _photometric(problem: CarProblem) -> PhotometricEvidence | None:
     return next((each for each in problem.evidence if isinstance(each, PhotometricEvidence)), None)
 
 
+def stage_of_tracks(stages: Sequence[StageConfig]) -> StageConfig:
+    """The last stage, with all unknowns that some stage moves; views that depend on each other need more iterations."""
+    last = stages[-1]
+    unknowns = last.unknowns if all(stage.unknowns == last.unknowns for stage in stages) else "both"
+    return replace(last, max_iterations=_MORE_ITERATIONS * last.max_iterations, unknowns=unknowns)
+
+
 def in_tracks(
     problem: CarProblem, sharing: Groups, views: CarBatch, alone: CarState, trusted: Tensor, next_view: Tensor
 ) -> CarProblem:
@@ -209,10 +218,7 @@ def in_tracks(
     """
     one = torch.ones_like(sharing.of_problem, dtype=torch.float64)
     factors = one[:, None].expand(-1, len(problem.term_names)) if problem.factors is None else problem.factors
-    last = problem.config.stages[-1]
-    # Views that depend on each other need more iterations to converge.
-    last = replace(last, max_iterations=_MORE_ITERATIONS * last.max_iterations)
-    config = replace(problem.config, stages=(last,))
+    config = replace(problem.config, stages=(stage_of_tracks(problem.config.stages),))
     added: list[Evidence] = [*motion_terms(config.tracks, views)]
     columns: list[Tensor] = []
     if added:

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from directshape_torch.compile import compiling
 from directshape_torch.config import RefinerConfig
-from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.observation.packing import Observation, pack_pixels
@@ -91,11 +90,8 @@ def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections
     The last state is the optimum of the images; the result may lie between it and the detector's box.
 
     Raises:
-        InputError: frames, detections and prior do not fit together, or the method is "box_alignment", which has no
-            steps.
+        InputError: frames, detections and prior do not fit together.
     """
-    if refiner.config.method == "box_alignment":
-        raise InputError("method", "one that iterates", "box_alignment", "trace direct, geometric or combined")
     result = refiner(frames, detections)
     took_part = result.cost_before.isfinite().all(dim=1)
     rows = took_part.nonzero()[:, 0]
@@ -134,7 +130,8 @@ def _ends(minimum: Minimum[CarState]) -> list[CarState]:
     return ends
 
 
-def without_photometry(refiner: DirectShapeRefiner) -> DirectShapeRefiner:
+def without_depth(refiner: DirectShapeRefiner) -> DirectShapeRefiner:
     """A refiner with silhouettes and priors only, whose poses drift (paper, figure of the projection's drift)."""
     config = refiner.config
-    return DirectShapeRefiner(refiner.prior, replace(config, photometric=replace(config.photometric, weight=0.0)))
+    photometric, cloud = replace(config.photometric, weight=0.0), replace(config.point_cloud, weight=0.0)
+    return DirectShapeRefiner(refiner.prior, replace(config, photometric=photometric, point_cloud=cloud))

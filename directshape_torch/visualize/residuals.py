@@ -116,7 +116,15 @@ def residual_maps(
     Masks are from the detections; photometric pixels are from the car in the state.
     """
     sampling = replace(config.sampling, mode="uniform", mode_right="uniform", density=1.0, max_pixels=_MOST_PIXELS)
-    config = replace(config, method="direct", compile="off", sampling=sampling)
+    # Residuals do not depend on weights, so there are maps of a run that was not fitted to the images too.
+    config = replace(
+        config,
+        silhouette=replace(config.silhouette, weight=1.0),
+        photometric=replace(config.photometric, weight=1.0),
+        point_cloud=replace(config.point_cloud, weight=0.0),
+        compile="off",
+        sampling=sampling,
+    )
     frame, detections = loaded.frame, loaded.detections
     chosen, found = torch.zeros(len(detections), dtype=torch.bool).index_fill(0, rows, True), []
     with full_precision():

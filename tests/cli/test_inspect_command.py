@@ -34,7 +34,7 @@ def test_demo_car(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert animation.n_frames > 3
 
 
-@pytest.mark.parametrize("setting", ["method=geometric", "photometric.weight=0", "silhouette.weight=0"])
+@pytest.mark.parametrize("setting", ["photometric.weight=0", "silhouette.weight=0"])
 def test_without_both_of_the_papers_terms_there_is_no_drift(setting: str) -> None:
     data = demo_dataset()
     refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off", setting]))

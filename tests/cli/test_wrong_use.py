@@ -77,8 +77,11 @@ CASES = [
     (f"{MASKED} --prior pcaa", "directshape build-prior; bundled ones are pca and neural"),
     (f"{MASKED} --threads 0", "threads: expected at least 1, got 0"),
     (f"{MASKED} --lidar nowhere", "nowhere: is no folder of LiDAR scans"),
-    (f"{MASKED} --disparity x", "--disparity: expected a method that uses it, got direct; add --method"),
-    (f"{MASKED} --method geometric --disparity nowhere", "is no folder of disparity maps"),
+    (
+        f"{MASKED} --disparity x",
+        "--disparity: expected settings that fit points, got point_cloud.weight 0; add --config",
+    ),
+    (f"{MASKED} --config geometric --disparity nowhere", "is no folder of disparity maps"),
     (
         "check-data --data {root} --detections {root}/detections --masks {root}/masks --frames 77",
         "such as 000000, got 77",

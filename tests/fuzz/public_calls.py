@@ -39,7 +39,7 @@ from directshape_torch.shape.prior_file import PriorProvenance
 from directshape_torch.terms.lidar import LidarPoints
 from directshape_torch.visualize.overlay import overlay
 
-QUICK = ("stages=[{contour_width_px: 0.5, image_level: 0, max_iterations: 1}]", "method=combined")
+QUICK = ("stages=[{contour_width_px: 0.5, image_level: 0, max_iterations: 1}]", "point_cloud.weight=30")
 Place = tuple[str, ...]
 Arguments = Mapping[str, Any]
 
@@ -178,7 +178,7 @@ def calls() -> dict[str, Call]:
         "words": Call({"convention": "kitti", "frame": "cam"}, lambda a: [_result().to_boxes(**a)]),
         "rig state": Call({"state": RigEstimate.of_frames(frames).get_extra_state()}, _rig_state),
         "fit prior": Call({"samples": prior.values(torch.eye(3, prior.num_codes).double()), **_FIT}, _fitted_prior),
-        "overrides": Call({"path": None, "overrides": ["method=direct"]}, lambda a: [_number(load_config(**a))]),
+        "overrides": Call({"path": None, "overrides": ["check=off"]}, lambda a: [_number(load_config(**a))]),
         "prior file": Call({"source": "pca"}, lambda a: [torch.tensor(load_prior(**a).num_codes)]),
         "field file": Call({"path": Path("none.json")}, lambda a: [load_field(a["path"]).coefficients]),
         "overlay": Call(

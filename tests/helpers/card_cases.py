@@ -32,7 +32,7 @@ from directshape_torch.shape.shape_prior import ShapePrior
 from helpers.five_cars import five_cars, with_solver
 from helpers.pretended_card import CARD, CardTensor, noted_waits, pretended_card
 from helpers.priors import prior_of
-from helpers.problems import DEFAULT
+from helpers.problems import DEFAULT, GEOMETRIC
 from helpers.synthetic_scene import disturbed, measured_street
 
 _SHIPPED = load_config("default", ["compile=off"])
@@ -45,7 +45,7 @@ SETTINGS: dict[str, RefinerConfig] = {
     "product form, marched rays": with_solver(
         replace(_FEW_STEPS, silhouette=replace(DEFAULT.silhouette, form="product")), rays="marched"
     ),
-    "point cloud": replace(DEFAULT, method="geometric", point_cloud=replace(DEFAULT.point_cloud, rounds=2)),
+    "point cloud": replace(GEOMETRIC, stages=GEOMETRIC.stages[:4]),
     "implicit gradients": replace(DEFAULT, backward=replace(DEFAULT.backward, mode="implicit")),
 }
 
@@ -65,7 +65,7 @@ UNROLLED = replace(_FEW_STEPS, backward=replace(DEFAULT.backward, mode="unroll")
 
 def compare(config: RefinerConfig, prior: ShapePrior | None = None, tracks: bool = False) -> dict[str, float]:
     """The largest difference between the devices of each figure and its gradients."""
-    if config.method == "direct":
+    if not config.fits_points:
         street_prior, frames, detections = _numbered() if tracks else five_cars()
     else:
         street_prior, street = measured_street()

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import AcceptanceConfig, RefinerConfig, RigConfig, StageConfig
+from directshape_torch.io.config_files import load_config
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
@@ -43,6 +44,14 @@ PAPER = replace(
     sampling=replace(DEFAULT.sampling, occlusion_order="box_bottom"),
 )
 CONFIGS = {"default": DEFAULT, "paper": PAPER}
+# The point cloud and the priors alone.
+GEOMETRIC = replace(
+    DEFAULT,
+    silhouette=replace(DEFAULT.silhouette, weight=0.0),
+    photometric=replace(DEFAULT.photometric, weight=0.0),
+    point_cloud=load_config("geometric").point_cloud,
+    stages=load_config("geometric").stages,
+)
 
 
 def begun_stage(

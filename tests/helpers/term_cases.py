@@ -18,8 +18,8 @@ from helpers.synthetic_scene import Street, cached_street, disturbed, measured_s
 
 GENERAL_RIGHT = se3.exp(torch.tensor([-0.53, -0.003, 0.004, 0.004, -0.01, 0.002], dtype=torch.float64))
 # A corner that some of the residuals exceed, so that both branches of the norm count.
-CLOUD = PointCloudConfig(huber_m=0.03, min_points=20, max_points=200)
-COMBINED = replace(DEFAULT, method="combined", point_cloud=CLOUD)
+CLOUD = PointCloudConfig(weight=30.0, huber_m=0.03, min_points=20, max_points=200)
+COMBINED = replace(DEFAULT, point_cloud=CLOUD)
 ALL_CONFIGS = {**CONFIGS, "combined": COMBINED}
 REGIMES = ("typical", "three_sigma", "near", "far", "border", "rotated_right_camera")
 

@@ -109,7 +109,7 @@ def test_gradients_pass_where_results_do_not(mode: str) -> None:
     assert by_weight[1 - less] != 0
 
 
-def test_other_methods_have_no_probability_and_are_not_refused() -> None:
+def test_other_terms_give_no_probability_and_are_not_refused() -> None:
     prior, scene = cached_street()
     blind = replace(DEFAULT, photometric=replace(DEFAULT.photometric, weight=0.0))
     result = DirectShapeRefiner(prior, accepting(1.0, blind))(scene.frames, scene.detections)

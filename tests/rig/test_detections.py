@@ -20,6 +20,12 @@ from directshape_torch.scene import Detections, FrameBatch
 
 DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 DISPARITY, OFFSET, ROW_OFFSET = 2, 3, 5
+POINTS_ALONE = (
+    "silhouette.weight=0",
+    "photometric.weight=0",
+    "point_cloud.weight=300",
+    "priors.detector_weight=0",
+)
 
 
 @pytest.fixture(scope="module")
@@ -134,15 +140,15 @@ def test_the_refiner_corrects_frames_by_its_rig(demo: LoadedFrame) -> None:
             use(other)
 
 
-def test_what_an_estimate_of_few_cars_says_gives_way_to_settings_and_methods(demo: LoadedFrame) -> None:
+def test_what_an_estimate_of_few_cars_says_gives_way_to_settings_and_points(demo: LoadedFrame) -> None:
     rig = RigEstimate.of_frames(demo.frame)
     rig.update(demo.frame, demo.detections)
     frames, plain = rig.corrected(demo.frame), demo.detections
     informed = rig.informed(frames, plain)
     for config, heard in (
         (["priors.pose_sigma_yaw_deg=1"], replace(informed, pose_sigma=None)),
-        # Its points know no offset: the covariance keeps what it owes to the field.
-        (["method=geometric", "point_cloud.rounds=1"], replace(informed, offset_sigma_px=None)),
+        # Points know no offset: the covariance keeps what it owes to the field.
+        (POINTS_ALONE, replace(informed, offset_sigma_px=None)),
     ):
         once = ["stages=[{max_iterations: 1}]", *EVERY_RESULT]
         settings = directshape_torch.load_config("fast", [*once, *config])

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
 
 import torch
 from helpers.ellipsoids import CENTRE_OBJ, HALF_AXES, ellipsoid_prior
-from helpers.problems import begun_stage, figures_at
+from helpers.problems import begun_stage
 from helpers.synthetic_scene import disturbed, measured_street
-from helpers.term_cases import CLOUD, COMBINED
+from helpers.term_cases import COMBINED
 from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig
@@ -30,7 +29,7 @@ T_CAM_OBJ = se3.exp(torch.tensor([[2.0, 1.6, 10.0, 0.0, 0.7, 0.0]], dtype=torch.
 def _at(points_cam: Tensor, T_cam_obj: Tensor = T_CAM_OBJ) -> Linear:
     """The term of one car and its points (P, 3)."""
     points = PointSamples(torch.zeros(len(points_cam), dtype=torch.long), points_cam, torch.tensor([len(points_cam)]))
-    term = PointCloud.of_points(PointCloudConfig(min_points=1), points)
+    term = PointCloud.of_points(PointCloudConfig(weight=300.0, min_points=1), points)
     state = CarState.of(se3.inverse(T_cam_obj), PRIOR.initial_code(1))
     return term.linear(field_of(PRIOR.bind(state.code)), state, ())
 
@@ -62,27 +61,22 @@ class _Known(PointCloud):
 
 def test_the_fisher_matrix_has_the_weight_that_the_norm_gives_it() -> None:
     points = PointSamples(torch.zeros(5, dtype=torch.long), torch.randn(5, 3).double(), torch.tensor([5]))
-    term = _Known.of_points(PointCloudConfig(min_points=1), points)
+    term = _Known.of_points(PointCloudConfig(weight=300.0, min_points=1), points)
     state = CarState.of(T_CAM_OBJ, PRIOR.initial_code(1))
     at = term.linear(field_of(PRIOR.bind(state.code)), state, ())
     J, weight = at.J_inner_state[0, :5], 3 + at.residual[0, :5]
     torch.testing.assert_close(part_of(term, at).information[0], J.mT @ (weight * J))
 
 
-def _of(config: PointCloudConfig, method: Literal["geometric", "combined"] = "combined") -> tuple[CarStage, CarState]:
+def _of(config: PointCloudConfig) -> tuple[CarStage, CarState]:
     prior, scene = measured_street()
-    settings = replace(COMBINED, method=method, point_cloud=config)
+    settings = replace(COMBINED, point_cloud=config)
     return begun_stage(prior, scene.frames, disturbed(scene.detections, 0.08, 0.03), settings, 0)
-
-
-def test_beside_the_images_points_have_a_tenth_of_their_weight() -> None:
-    alone, beside = (figures_at(*_of(CLOUD, method)).term_costs[:, 0] for method in ("geometric", "combined"))
-    torch.testing.assert_close(10 * beside, alone)
 
 
 def test_a_car_without_enough_points_has_no_part_in_the_term() -> None:
     car, counts = torch.tensor([0] * 4 + [1] * 5), torch.tensor([4, 5])
     points = PointSamples(car, torch.randn(9, 3, dtype=torch.float64), counts)
-    term = PointCloud.of_points(PointCloudConfig(min_points=5), points)
+    term = PointCloud.of_points(PointCloudConfig(weight=300.0, min_points=5), points)
     assert term.blocks.counts == (0, 1)
-    assert float(term.block_weight[0]) == PointCloudConfig().weight / 5
+    assert float(term.block_weight[0]) == 300 / 5

@@ -409,6 +409,14 @@ def test_a_track_that_a_compiler_traces_ends_where_a_plain_one_does(monkeypatch:
     torch.testing.assert_close(traced.code, plain.code, rtol=0, atol=0.1)
 
 
+@pytest.mark.parametrize(
+    ("unknowns", "of_track"), [(("pose", "shape"), "both"), (("both", "both"), "both"), (("pose", "pose"), "pose")]
+)
+def test_a_track_moves_all_that_some_stage_moves(unknowns: tuple[Any, ...], of_track: str) -> None:
+    stages = [StageConfig(max_iterations=number, unknowns=each) for number, each in enumerate(unknowns)]
+    assert share.stage_of_tracks(stages) == StageConfig(max_iterations=2, unknowns=of_track)  # type: ignore[arg-type]
+
+
 def test_a_term_of_ones_own_has_another_name_than_those_of_a_track() -> None:
     prior, (frames, detections, _) = ellipsoid_prior(), drive()
     detections = replace(detections, track_id=torch.tensor([0, 1] * 3))

@@ -1,4 +1,4 @@
-"""These tests run `directshape refine --method` and `--disparity` as a user types them."""
+"""These tests run `directshape refine` with the presets that fit points, and `--disparity`, as a user types them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.stereo_dataset import open_dataset
 
-QUICK = ("--set", "point_cloud.rounds=1", "point_cloud.min_points=50", "stages=[{max_iterations: 2}]")
+QUICK = ("--set", "point_cloud.min_points=50", "stages=[{max_iterations: 2}]")
 
 
 @pytest.fixture(scope="module")
@@ -38,20 +38,20 @@ def refine(root: Path, out: Path, *extra: str) -> int:
     return main(["refine", *input_options(root), "--out", str(out), *QUICK, *extra])
 
 
-@pytest.mark.parametrize("method", ["geometric", "combined"])
-def test_a_method_with_disparity_maps(source: Path, tmp_path: Path, method: str) -> None:
-    assert refine(source, tmp_path, "--method", method, "--disparity", str(source / "disparity")) == 0
+@pytest.mark.parametrize("preset", ["geometric", "combined"])
+def test_a_preset_with_disparity_maps(source: Path, tmp_path: Path, preset: str) -> None:
+    assert refine(source, tmp_path, "--config", preset, "--disparity", str(source / "disparity")) == 0
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["config"]["refiner"]["method"] == method
+    assert summary["config"]["refiner"]["point_cloud"]["weight"] == {"geometric": 300, "combined": 30}[preset]
     assert set(RunFolder(tmp_path).read("000001").record.inputs) >= {"disparity", "image_left"}
     for frame_id in ("000000", "000001"):
         shapes = read_shapes(tmp_path / "shapes" / f"{frame_id}.npz")
         assert "point_cloud" in shapes.term_names
-        assert ("photometric" in shapes.term_names) == (method == "combined")
+        assert ("photometric" in shapes.term_names) == (preset == "combined")
 
 
 def test_without_maps_the_images_are_matched(source: Path, tmp_path: Path) -> None:
-    assert refine(source, tmp_path, "--method", "geometric", "--frames", "0") == 0
+    assert refine(source, tmp_path, "--config", "geometric", "--frames", "0") == 0
     assert "disparity" not in RunFolder(tmp_path).read("000000").record.inputs
 
 
@@ -59,7 +59,7 @@ def test_a_bad_map_fails_its_frame_alone(source: Path, tmp_path: Path, capsys: p
     folder = Path(shutil.copytree(source / "disparity", tmp_path / "disparity"))
     write_disparity(folder / "000000.png", np.ones((9, 9)))
     out = tmp_path / "out"
-    assert refine(source, out, "--method", "geometric", "--disparity", str(folder)) == 1
+    assert refine(source, out, "--config", "geometric", "--disparity", str(folder)) == 1
     assert "frame 000000 failed: " in (message := capsys.readouterr().err)
     assert "000000.png: has 9 x 9 pixels, the left image 160 x 120" in message
     assert (out / "data" / "000001.txt").is_file()
