@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -23,7 +24,7 @@ from directshape_torch.solver.sharing import INDEPENDENT, Sharing
 from directshape_torch.state.unknowns import LARGEST_ROTATION_RAD, AnyState, State, Unknowns
 from directshape_torch.terms.depth import marched_views
 from directshape_torch.terms.photometric import Photometric
-from directshape_torch.terms.priors import PriorTerm, joined
+from directshape_torch.terms.priors import with_joined_priors
 from directshape_torch.terms.silhouette import MaskRows
 from directshape_torch.terms.term import (
     Evaluation,
@@ -65,6 +66,10 @@ class CarProblem:
 
     def stages(self) -> tuple[StageConfig, ...]:
         return self.config.stages
+
+    def evidence_of(self, name: str) -> Evidence | None:
+        """The library's evidence that fills the column `name`; None if it has no part in the energy."""
+        return next((each for each in self.evidence if name in each.names), None)
 
     def parts(
         self, terms: tuple[Term, ...], field: Field, state: State, wheres: tuple[Where, ...], fisher: bool = True
@@ -129,7 +134,12 @@ class CarStage:
     @property
     def photometric(self) -> Photometric | None:
         """The photometric term, which the disparity profile is made of."""
-        return next((term for term in self.terms if isinstance(term, Photometric)), None)
+        return cast("Photometric | None", self.term("photometric"))
+
+    def term(self, name: str) -> Term | None:
+        """The library's term that fills the column `name`; None if it has no part in the energy."""
+        own = self.terms[: len(self.problem.evidence)]
+        return next((term for term in own if name in term.names), None)
 
     def photometric_part(self, figures: Figures) -> Part | None:
         """What the photometric term says among the figures of a state."""
@@ -181,28 +191,26 @@ class CarStage:
         # The marched energy is differentiated afterwards, so its minimum must be found. This holds under `no_grad` too,
         # so that evaluation and training give equal results.
         if problem.config.solver.rays == "marched" or problem.config.backward.mode != "none":
-            terms, rest = self._with_joined_priors(), None
+            terms, rest = self._iterated_terms(), None
             wheres = tuple(term.where(sight) for term in terms)
         else:
-            moving = [term.moving(sight, self.after_wider) for term in self._with_joined_priors()]
+            moving = [term.moving(sight, self.after_wider) for term in self._iterated_terms()]
             terms, wheres, costs = (tuple(x) for x in zip(*moving, strict=True))
             by_column = torch.cat(costs, dim=1)
             rest = (by_column if problem.factors is None else by_column * problem.factors).sum(dim=1)
         iterations = CarIterations.of(self, terms, rest, problem.factors, problem.masks, problem.sharing)
         return iterations, iterations.evaluated(sight.field, sight.state, wheres)
 
-    def _with_joined_priors(self) -> tuple[Term, ...]:
-        """The terms with the library's priors joined into one, if cars have no factors; a user's terms stay separate.
+    def _iterated_terms(self) -> tuple[Term, ...]:
+        """The terms with the library's priors joined, if cars have no factors; a user's terms stay separate.
 
-        A joined prior needs fewer operations. Compiled code does not join priors: it has one form for this and for
-        `figures`, and separate priors cost nothing there.
+        Compiled code does not join priors: it has one form for this and for `figures`, and separate priors cost nothing
+        there.
         """
-        own = self.terms[: len(self.terms) - len(self.problem.extra_terms)]
-        priors = [term for term in own if isinstance(term, PriorTerm) and term.is_prior]
-        if not priors or self.problem.factors is not None or will_compile():
+        if self.problem.factors is not None or will_compile():
             return self.terms
-        others = [term for term in own if not (isinstance(term, PriorTerm) and term.is_prior)]
-        return (*others, joined(priors), *self.terms[len(own) :])
+        own = len(self.problem.evidence)
+        return (*with_joined_priors(self.terms[:own]), *self.terms[own:])
 
     def linearise_differentiably(self, state: State) -> Evaluation:
         """The hand-derived linearisation with an autograd graph to state, images, masks, prior and weights."""

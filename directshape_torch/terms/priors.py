@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -160,8 +160,17 @@ def prior_terms(config: PriorConfig, prior: ShapePrior, cars: CarBatch) -> list[
     return [term for term in all_terms if term.weight > 0]
 
 
-def joined(terms: Sequence[PriorTerm]) -> PriorTerm:
-    """One term with the total cost of priors of pose and shape, because an iteration needs only the sum."""
+def with_joined_priors(terms: Sequence[Term]) -> tuple[Term, ...]:
+    """The library's terms with those that are priors joined into one, because an iteration needs only their sum.
+
+    Every prior of the library is a `PriorTerm` of pose and shape. A joined prior needs fewer operations.
+    """
+    priors = cast("list[PriorTerm]", [term for term in terms if term.is_prior])
+    others = [term for term in terms if not term.is_prior]
+    return (*others, _joined(priors)) if priors else tuple(others)
+
+
+def _joined(terms: Sequence[PriorTerm]) -> PriorTerm:
 
     def residual_of(cars: CarBatch, state: State) -> PriorResidual:
         unknowns = state.unknowns.only(POSE, CODE)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -173,7 +174,7 @@ class Views:
         """Unlikeness (B,) of each car and the next view of its part; 0 for cars outside these views."""
         minimum = in_track.minimum
         nothing = torch.zeros(len(self.keep), dtype=minimum.after.cost.dtype, device=self.keep.device)
-        term = next((term for term in minimum.stage.terms if isinstance(term, NextView)), None)
+        term = cast("NextView | None", minimum.stage.term(NEXT_VIEW_NAME))
         stereo = _photometric(self.problem)
         if term is None or stereo is None:
             return nothing
@@ -198,7 +199,7 @@ def _looks_at_next(problem: CarProblem) -> bool:
 
 
 def _photometric(problem: CarProblem) -> PhotometricEvidence | None:
-    return next((each for each in problem.evidence if isinstance(each, PhotometricEvidence)), None)
+    return cast("PhotometricEvidence | None", problem.evidence_of("photometric"))
 
 
 def stage_of_tracks(stages: Sequence[StageConfig]) -> StageConfig:

@@ -79,8 +79,9 @@ def car_residuals(stage: CarStage, pixels: Observation, sight: Sight) -> list[Ca
                 value = at.residual[..., 0][(masks.filled > 0) & (masks.side == side)[:, None]]
                 signed = torch.where(of_side.foreground > 0.5, -value, value)
                 parts[term.names[side]] = of_side.object_index, of_side.uv, signed, torch.zeros_like(value).bool()
-        elif isinstance(term, Photometric):
-            parts["photometric"] = _of_photometry(term, at, pixels.left)
+    photometric, at_photometric = stage.photometric, stage.photometric_part(figures)
+    if photometric is not None and at_photometric is not None:
+        parts["photometric"] = _of_photometry(photometric, at_photometric, pixels.left)
     return [
         CarResiduals(*(_of_car(parts[name], car) for name in CarResiduals._fields))
         for car in range(len(sight.state.code))
