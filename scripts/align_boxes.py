@@ -39,7 +39,7 @@ from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.result import KittiBoxes
 from directshape_torch.rows import CarSums, ObjectRays, Rays
 from directshape_torch.solver.problem import take_rows
-from directshape_torch.state.cars import CarBatch, CarState, move_by_disparity
+from directshape_torch.state.cars import CarBatch, CarState
 from directshape_torch.terms.depth import Hits
 from directshape_torch.terms.photometric import Photometric, Surface
 
@@ -91,6 +91,16 @@ def aligned(refiner: DirectShapeRefiner, frames: FrameBatch, detections: Detecti
     chosen = rows[converged]
     T_cam_obj = nothing.T_cam_obj.index_copy(0, chosen, se3.inverse(state.T_obj_cam)[converged])
     return Aligned(T_cam_obj, nothing.is_aligned.index_fill(0, chosen, True))
+
+
+def move_by_disparity(state: CarState, focal_baseline: Tensor, offset_px: float | Tensor) -> CarState:
+    """Cars moved along the viewing ray of their origin so that its disparity grows by `offset_px`, (B,) or a number."""
+    T_cam_obj = se3.inverse(state.T_obj_cam)
+    origin = T_cam_obj[:, :3, 3]
+    disparity = focal_baseline / origin[:, 2]
+    scale = disparity / (disparity + offset_px).clamp_min(0.1)
+    moved = se3.from_rotation_translation(T_cam_obj[:, :3, :3], origin * scale[:, None])
+    return state._replace(T_obj_cam=se3.inverse(moved))
 
 
 def box_hits(

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.geometry import se3
 from directshape_torch.numerics.records import Record
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.state.unknowns import Unknowns, blocks_of_car
@@ -40,16 +39,6 @@ class CarState(NamedTuple):
             tensor([[0.5000, 3.0000]])
         """
         return Unknowns(blocks_of_car(self.code.shape[1], self.offset_px.shape[1]))
-
-
-def move_by_disparity(state: CarState, focal_baseline: Tensor, offset_px: float | Tensor) -> CarState:
-    """Cars moved along the viewing ray of their origin so that its disparity grows by `offset_px`, (B,) or a number."""
-    T_cam_obj = se3.inverse(state.T_obj_cam)
-    origin = T_cam_obj[:, :3, 3]
-    disparity = focal_baseline / origin[:, 2]
-    scale = disparity / (disparity + offset_px).clamp_min(0.1)
-    moved = se3.from_rotation_translation(T_cam_obj[:, :3, :3], origin * scale[:, None])
-    return state._replace(T_obj_cam=se3.inverse(moved))
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from align_boxes import move_by_disparity
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import CONFIGS, DEFAULT, begun_stage, figures_at, photometric_of
 from helpers.synthetic_scene import CAMERA_HEIGHT_M, Street, cached_street, disturbed, masked, select, street
@@ -25,7 +26,7 @@ from directshape_torch.refinement.disparity_profile import (
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import FrameBatch
-from directshape_torch.state.cars import CarState, move_by_disparity
+from directshape_torch.state.cars import CarState
 from directshape_torch.terms.photometric import Surface
 
 OFFSETS = profile_offsets()

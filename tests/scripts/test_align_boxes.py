@@ -20,7 +20,7 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rows import Rays
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
-from directshape_torch.state.cars import CarState, move_by_disparity
+from directshape_torch.state.cars import CarState
 
 
 @lru_cache
@@ -53,7 +53,7 @@ def test_disparity_moves_the_origin_along_its_viewing_ray() -> None:
     )
     state = CarState.of(se3.inverse(before), torch.zeros(2, 3).double())
     focal_baseline = torch.tensor([380.0, 380.0]).double()
-    after = se3.inverse(move_by_disparity(state, focal_baseline, 1.5).T_obj_cam)
+    after = se3.inverse(script.move_by_disparity(state, focal_baseline, 1.5).T_obj_cam)
     torch.testing.assert_close(380 / after[:, 2, 3], 380 / before[:, 2, 3] + 1.5)
     ratio = after[:, :3, 3] / before[:, :3, 3]
     torch.testing.assert_close(ratio, ratio[:, :1].expand(2, 3))
