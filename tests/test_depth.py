@@ -44,7 +44,7 @@ def test_a_surface_that_is_gone_is_not_found() -> None:
     in_objects = rays.in_objects(_pose((4.0, 0.0, 0.0)))
     depth = tracked_depth(FIELD, rays, in_objects, hits)
     assert depth.isfinite().all()
-    assert (FIELD.value(in_objects.at(depth), OWNER) > 0.03).all()
+    assert (FIELD.sdf(in_objects.at(depth), OWNER) > 0.03).all()
 
 
 def test_a_plane_along_the_ray_is_no_guide() -> None:
@@ -63,7 +63,7 @@ def test_a_surface_beside_a_face_where_its_slope_jumps_is_reached() -> None:
     behind = 0.1 * torch.arange(-5, 6, dtype=torch.float64)  # metres behind the face, of the nodes along z
     values = -1.6e-5 - torch.where(behind > 0, 0.16, 0.75) * behind
     shape = values.expand(1, 3, 3, -1).contiguous()
-    field = GridShape(shape, torch.zeros(3, 3, 11, 1).double(), torch.tensor([-0.1, -0.1, -0.5]).double(), 0.1).field
+    field = GridShape.of(shape, torch.zeros(3, 3, 11, 1).double(), torch.tensor([-0.1, -0.1, -0.5]).double(), 0.1)
     rays = Rays(OWNER, torch.zeros(1, 3).double(), torch.tensor([0.0, 0.0, 1.0]).double().view(3, 1, 1))
     in_objects, depth = rays.in_objects(_pose((0.0, 0.0, 0.0))), torch.full((1, 1), 10.00026).double()
     for _ in range(6):

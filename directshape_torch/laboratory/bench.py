@@ -230,7 +230,7 @@ def _chosen(
         closest = closest_of_march(field, owner, rays, bounds, marched)
         hits = first_hits(field, owner, rays, marched, closest)
         if regime.pixels == "contour":
-            sdf = field.value(closest.points_obj, owner)
+            sdf = field.sdf(closest.points_obj, owner)
             wanted = (zeta[owner][:, None] * sdf).abs() < _CONTOUR
         elif regime.pixels == "grazing":
             slope = (hits.normal_obj * rays.direction_obj).sum(0).abs()

@@ -86,7 +86,7 @@ def fit_quality(
 
 def mask_ious(masks: MaskRows, seen: Sight) -> Tensor:
     """IoU (2, B) of shape and mask over the pixels of the left and the right image."""
-    distance = seen.field.value(seen.closest.points_obj, masks.rays.owner)
+    distance = seen.field.sdf(seen.closest.points_obj, masks.rays.owner)
     counts = masks.filled.to(torch.float64)
     covered, masked = seen.closest.crosses & (distance < 0), masks.foreground > MASK_THRESHOLD
     both, either = ((x * counts).sum(dim=1) for x in (covered & masked, covered | masked))

@@ -38,5 +38,5 @@ def cast(
     marched = march(field, owner, rays, prior.bounds_obj, num_samples)
     closest = closest_of_march(field, owner, rays, prior.bounds_obj, marched)
     hits = first_hits(field, owner, rays, marched, closest)
-    sdf = torch.where(closest.crosses, field.value(closest.points_obj, owner), torch.inf)
+    sdf = torch.where(closest.crosses, field.sdf(closest.points_obj, owner), torch.inf)
     return RayCast(sdf[:, 0], torch.where(hits.found, hits.depth, torch.nan)[:, 0])

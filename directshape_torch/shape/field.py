@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from directshape_torch.numerics.tensors import length
-from directshape_torch.shape.sdf_grid import GridShape, Lookup, RayMinimum
-from directshape_torch.shape.shape_prior import BoundShape
+from directshape_torch.shape.sdf_grid import GridShape, RayMinimum
+from directshape_torch.shape.shape_prior import BoundShape, SdfDerivatives
 
 # A search along a ray that knows only values begins with three samples at this distance from each other.
 _FIRST_SAMPLES_M = 0.06
@@ -26,7 +26,7 @@ _LEAST_CURVATURE_M = 1e-6
 class Field(Protocol):
     """A `Field` gives signed distances of B cars; points (3, ..., M, R) belong to the cars (M,) of their blocks."""
 
-    def value(self, points_obj: Tensor, owner: Tensor, inside: bool = False) -> Tensor:
+    def sdf(self, points_obj: Tensor, owner: Tensor, inside: bool = False) -> Tensor:
         """Signed distance (..., M, R), metres; `inside` says that the points that count are within the bounds."""
         ...
 
@@ -34,7 +34,9 @@ class Field(Protocol):
         """Gradient (3, ..., M, R) of the signed distance, as a constant."""
         ...
 
-    def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False, inside: bool = False) -> Lookup:
+    def derivatives(
+        self, points_obj: Tensor, owner: Tensor, constant: bool = False, inside: bool = False
+    ) -> SdfDerivatives:
         """Value, gradient and code derivative of the signed distance.
 
         `constant` says that they will not be differentiated again, `inside` that all points that count are within the
@@ -65,16 +67,18 @@ class PackedField(NamedTuple):
 
     shape: BoundShape
 
-    def value(self, points_obj: Tensor, owner: Tensor, inside: bool = False) -> Tensor:
+    def sdf(self, points_obj: Tensor, owner: Tensor, inside: bool = False) -> Tensor:
         return self.shape.value(*_packed(points_obj, owner)).view(points_obj.shape[1:])
 
     def gradient(self, points_obj: Tensor, owner: Tensor) -> Tensor:
         return self.derivatives(points_obj, owner, constant=True).gradient.detach()
 
-    def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False, inside: bool = False) -> Lookup:
+    def derivatives(
+        self, points_obj: Tensor, owner: Tensor, constant: bool = False, inside: bool = False
+    ) -> SdfDerivatives:
         at = self.shape.value_and_derivatives(*_packed(points_obj, owner))
         leading = points_obj.shape[1:]
-        return Lookup(
+        return SdfDerivatives(
             at.value.view(leading),
             at.gradient.mT.reshape(3, *leading),
             at.J_value_code.view(*leading, at.J_value_code.shape[-1]),
@@ -112,15 +116,12 @@ class PackedField(NamedTuple):
 
     def _along(self, owner: Tensor, centre_obj: Tensor, direction_obj: Tensor) -> Callable[[Tensor], Tensor]:
         """A function that gives the signed distances (n, M, R) at depths (n, M, R) of rays."""
-        return lambda depths: self.value(centre_obj[:, None] + depths * direction_obj[:, None], owner)
+        return lambda depths: self.sdf(centre_obj[:, None] + depths * direction_obj[:, None], owner)
 
 
 def field_of(shape: BoundShape) -> Field:
-    """The field of a bound shape: a `GridField` where the shape looks up in grids as a `GridShape` does."""
-    looks_up = type(shape).value, type(shape).value_and_derivatives
-    if isinstance(shape, GridShape) and looks_up == (GridShape.value, GridShape.value_and_derivatives):
-        return shape.field
-    return PackedField(shape)
+    """The field of a bound shape: a `GridShape` is one itself, but a class of one's own made of it may look up anew."""
+    return shape if type(shape) is GridShape else PackedField(shape)
 
 
 def _packed(points_obj: Tensor, owner: Tensor) -> tuple[Tensor, Tensor]:

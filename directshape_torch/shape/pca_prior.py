@@ -115,7 +115,7 @@ class PCAShapePrior(nn.Module):
 
     def bind(self, code: Tensor) -> GridShape:
         """The fields of B objects with codes (B, K): the basis is summed up into one grid for each object."""
-        return GridShape(self.values(code), self.basis, self.origin, self.spacing_m)
+        return GridShape.of(self.values(code), self.basis, self.origin, self.spacing_m)
 
     @in_full_precision
     def dimensions_and_derivative(self, code: Tensor) -> DimensionsDerivative:

@@ -17,7 +17,7 @@ derivative of the least distance is then the derivative at the fixed point, with
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, Self, TypeAlias
 
 import torch
 from torch import Tensor
@@ -39,36 +39,34 @@ _NO_STEP = 1e-12
 _BEYOND_GRIDS = 1e-20
 
 
-class GridShape:
-    """This `BoundShape` holds B signed distance fields on one grid and their common code derivative.
-
-    Args:
-        values: signed distance at the nodes, (B, nx, ny, nz), metres.
-        basis: derivative of the nodes by the code, (nx, ny, nz, K), metres per standard deviation.
-        origin: position of node (0, 0, 0) in the object frame, (3,), metres.
-        spacing_m: distance between nodes, metres.
+class GridShape(NamedTuple):
+    """A `GridShape` is B signed distance fields on one grid with a common code derivative: `BoundShape` and `Field`.
 
     Examples:
         >>> import torch
         >>> height_above_ground = -torch.arange(-2.0, 2.0)[None, None, :, None].expand(1, 3, 4, 3)
-        >>> shape = GridShape(height_above_ground, torch.zeros(3, 4, 3, 1), torch.tensor([0.0, -2.0, 0.0]), 1.0)
+        >>> shape = GridShape.of(height_above_ground, torch.zeros(3, 4, 3, 1), torch.tensor([0.0, -2.0, 0.0]), 1.0)
         >>> shape.value(torch.tensor([[1.0, -0.5, 1.0]]), torch.tensor([0]))
         tensor([0.5000])
     """
 
-    def __init__(self, values: Tensor, basis: Tensor, origin: Tensor, spacing_m: float) -> None:
-        self.values, self.basis, self.origin, self.spacing_m = values, basis, origin, spacing_m
+    values: Tensor  # (B, nx, ny, nz) signed distance at the nodes, metres
+    basis: Tensor  # (nx, ny, nz, K) derivative of the nodes by the code, metres per standard deviation
+    origin: Tensor  # (3,) position of node (0, 0, 0) in the object frame, metres
+    # (3,) number of the last node along each axis; a tensor, because the compiler turns constants into choices, which
+    # cost as much as sums
+    last: Tensor
+    spacing_m: float  # distance between nodes, metres
 
-    @property
-    def field(self) -> GridField:
-        """The field in which terms look up signed distances."""
-        last = constant_like(tuple(count - 1.0 for count in self.basis.shape[:3]), self.origin)
-        return GridField(self.values.reshape(-1), self.basis, self.origin, last, self.spacing_m)
+    @classmethod
+    def of(cls, values: Tensor, basis: Tensor, origin: Tensor, spacing_m: float) -> Self:
+        """The fields of B grids (B, nx, ny, nz) with a basis (nx, ny, nz, K) and node (0, 0, 0) at `origin` (3,)."""
+        return cls(values, basis, origin, constant_like(tuple(n - 1.0 for n in basis.shape[:3]), origin), spacing_m)
 
     @in_full_precision
     def value(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
         """Signed distance (P,) in metres at points (P, 3) of objects (P,)."""
-        return self.field.value(points_obj.mT.contiguous()[..., None], object_index)[:, 0]
+        return self.sdf(points_obj.mT.contiguous()[..., None], object_index)[:, 0]
 
     @in_full_precision
     def value_and_derivatives(self, points_obj: Tensor, object_index: Tensor) -> SdfDerivatives:
@@ -77,83 +75,28 @@ class GridShape:
         The gradient is the exact derivative of the trilinear lookup and of its continuation.
         """
         points, constant = points_obj.mT.contiguous()[..., None], nothing_is_differentiated()
-        at = self.field.derivatives(points, object_index, constant)
+        at = self.derivatives(points, object_index, constant)
         return SdfDerivatives(at.value[:, 0], at.gradient[..., 0].mT.contiguous(), at.J_value_code[:, 0])
 
-
-class GridField(NamedTuple):
-    """This `Field` holds B signed distance grids of one geometry and the basis that they are made of."""
-
-    values: Tensor  # (B * nx * ny * nz,) metres
-    basis: Tensor  # (nx, ny, nz, K) metres per standard deviation
-    origin: Tensor  # (3,) position of node (0, 0, 0), metres
-    # (3,) number of the last node along each axis; a tensor, because the compiler turns constants into choices, which
-    # cost as much as sums
-    last: Tensor
-    spacing_m: float  # distance between nodes, metres
-
-    @property
-    def num_nodes(self) -> int:
-        """Number of nodes of one grid."""
-        return math.prod(self.basis.shape[:3])
-
-    @property
-    def _strides(self) -> tuple[int, int, int]:
-        ny, nz = self.basis.shape[1:3]
-        return ny * nz, nz, 1
-
-    def positions(self, points_obj: Tensor) -> Tensor:
-        """Positions of points (3, ...), in cells from node (0, 0, 0)."""
-        return (points_obj - self.origin.view(3, *[1] * (points_obj.ndim - 1))) * (1 / self.spacing_m)
-
-    def last_nodes(self, like: Tensor) -> Tensor:
-        """Number of the last node along each axis, in a shape that broadcasts with points (3, ...)."""
-        return self.last.view(3, *[1] * (like.ndim - 1))
-
-    def steps(self, cells: Tensor) -> Tensor:
-        """Change (...) of the flat index of a node by moves (3, ...) of whole cells, in floating point."""
-        (of_x, of_y, _), (x, y, z) = self._strides, cells.unbind(0)
-        return torch.add(torch.add(z, y, alpha=of_y), x, alpha=of_x).int()
-
-    def lower_nodes(self, cells: Tensor) -> Tensor:
-        """Flat index (...), within one grid, of the lower corners of cells (3, ...); it is valid for NaN cells, too."""
-        return self.steps(cells).clamp(0, self.num_nodes - 1 - self.steps_to_last_corner)
-
-    @property
-    def steps_to_last_corner(self) -> int:
-        """Difference of the flat indices of the upper and the lower corner of a cell."""
-        return sum(self._strides)
-
-    def nodes_of(self, node: Tensor, owner: Tensor) -> Tensor:
-        """Flat index (..., M, R) among the nodes of all grids, from the index within one; it has 32 bits, for speed."""
-        return torch.add(node, owner[..., None].int(), alpha=self.num_nodes)
-
-    def at_corners(self, node: Tensor) -> Ends:
-        """Flat indices (8, ...) of the corners of cells, z outermost: 000, 100, 010, 110, 001, 101, 011, 111."""
-        x, y, z = self._strides
-        offsets = tuple(i * x + j * y + k * z for k in (0, 1) for j in (0, 1) for i in (0, 1))
-        if torch.compiler.is_compiling():
-            # The compiler would turn a table of numbers into choices, which keep it from using vector instructions.
-            return [node + offset for offset in offsets]
-        return node + constant_like(offsets, node).view(8, *[1] * node.ndim)
-
-    def value(self, points_obj: Tensor, owner: Tensor, inside: bool = False) -> Tensor:
+    def sdf(self, points_obj: Tensor, owner: Tensor, inside: bool = False) -> Tensor:
         cells = cells_at(self, points_obj)
-        value = _interpolated(corner_values(self, self.nodes_of(cells.lower_node, owner)), cells.fraction)
+        value = _interpolated(corner_values(self, nodes_of(self, cells.lower_node, owner)), cells.fraction)
         return value if inside else torch.add(value, cells.outward[1], alpha=self.spacing_m)
 
     def gradient(self, points_obj: Tensor, owner: Tensor) -> Tensor:
         return _value_and_gradient(self, cells_at(self, points_obj), owner)[1]
 
-    def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False, inside: bool = False) -> Lookup:
+    def derivatives(
+        self, points_obj: Tensor, owner: Tensor, constant: bool = False, inside: bool = False
+    ) -> SdfDerivatives:
         """Value, gradient and code derivative in one pass; `constant` allows a faster sum of the basis vectors."""
         cells = cells_at(self, points_obj)
         value, gradient = _value_and_gradient(self, cells, owner, inside)
-        table, corners = self.basis.flatten(0, 2), self.at_corners(cells.lower_node)
+        table, corners = self.basis.flatten(0, 2), at_corners(self, cells.lower_node)
         if constant and isinstance(corners, Tensor):
-            return Lookup(value, gradient, _summed(table, corners, cells.fraction))
+            return SdfDerivatives(value, gradient, _summed(table, corners, cells.fraction))
         rows = [embedding(corner, table) for corner in corners]
-        return Lookup(value, gradient, _interpolated(rows, cells.fraction[..., None]))
+        return SdfDerivatives(value, gradient, _interpolated(rows, cells.fraction[..., None]))
 
     def minimum_along(
         self,
@@ -188,7 +131,7 @@ class GridField(NamedTuple):
             if number:
                 moves = crossed * into_next
                 # Rounding may lead a ray that ends at the border beyond the border, where none of its results are used.
-                node = (node + self.steps(moves)).clamp(0, len(self.values) - 1 - self.steps_to_last_corner)
+                node = (node + steps(self, moves)).clamp(0, self.values.numel() - 1 - sum(strides(self)))
                 place = place - moves
                 to_face = torch.addcmul(to_face, crossed, per_cell)
                 # A ray that has arrived is where the slope vanishes or grows, so it stays.
@@ -208,14 +151,6 @@ class GridField(NamedTuple):
         # In the very cell that a lookup at that depth takes, however near its faces are.
         step, node, place = _cells_along(self, owner, centre_obj, direction_obj, depth, 0.0)
         return 2 * _derivatives_along(self, node, place, step).second
-
-
-class Lookup(NamedTuple):
-    """A `Lookup` holds the value and the derivatives of a field at points (3, ...)."""
-
-    value: Tensor  # (...) metres
-    gradient: Tensor  # (3, ...)
-    J_value_code: Tensor  # (..., K)
 
 
 class RayMinimum(NamedTuple):
@@ -249,14 +184,31 @@ class Cells(NamedTuple):
         return outward, ((outward * outward).sum(0) + _TINY).sqrt()
 
 
-def cells_at(field: GridField, points_obj: Tensor) -> Cells:
-    """The cells at points (3, ...). A NaN point gets a valid cell at a distance of NaN and cannot disturb others."""
-    position = field.positions(points_obj)
-    last = field.last_nodes(position)
-    # `minimum` instead of `clamp_max` would halve derivatives on the last faces.
-    clamped = position.clamp_min(0).clamp_max(last)
-    lower = clamped.detach().floor().minimum(last - 1)
-    return Cells(field.lower_nodes(lower), clamped - lower, position, clamped)
+def strides(grid: GridShape) -> tuple[int, int, int]:
+    """Changes of the flat index of a node by one cell along each axis; their sum leads to a cell's upper corner."""
+    ny, nz = grid.basis.shape[1:3]
+    return ny * nz, nz, 1
+
+
+def positions(grid: GridShape, points_obj: Tensor) -> Tensor:
+    """Positions of points (3, ...), in cells from node (0, 0, 0)."""
+    return (points_obj - _along_axes(grid.origin, points_obj)) * (1 / grid.spacing_m)
+
+
+def steps(grid: GridShape, cells: Tensor) -> Tensor:
+    """Change (...) of the flat index of a node by moves (3, ...) of whole cells, in floating point."""
+    (of_x, of_y, _), (x, y, z) = strides(grid), cells.unbind(0)
+    return torch.add(torch.add(z, y, alpha=of_y), x, alpha=of_x).int()
+
+
+def lower_nodes(grid: GridShape, cells: Tensor) -> Tensor:
+    """Flat index (...), within one grid, of the lower corners of cells (3, ...); it is valid for NaN cells, too."""
+    return steps(grid, cells).clamp(0, math.prod(grid.basis.shape[:3]) - 1 - sum(strides(grid)))
+
+
+def nodes_of(grid: GridShape, node: Tensor, owner: Tensor) -> Tensor:
+    """Flat index (..., M, R) among the nodes of all grids, from the index within one; it has 32 bits, for speed."""
+    return torch.add(node, owner[..., None].int(), alpha=math.prod(grid.basis.shape[:3]))
 
 
 # `Ends` are values at the ends of edges: one tensor (n, ...), or n tensors (...) for the compiler, which makes one loop
@@ -264,13 +216,38 @@ def cells_at(field: GridField, points_obj: Tensor) -> Cells:
 Ends: TypeAlias = Tensor | list[Tensor]
 
 
-def corner_values(field: GridField, node: Tensor) -> Ends:
+def at_corners(grid: GridShape, node: Tensor) -> Ends:
+    """Flat indices (8, ...) of the corners of cells, z outermost: 000, 100, 010, 110, 001, 101, 011, 111."""
+    x, y, z = strides(grid)
+    offsets = tuple(i * x + j * y + k * z for k in (0, 1) for j in (0, 1) for i in (0, 1))
+    if torch.compiler.is_compiling():
+        # The compiler would turn a table of numbers into choices, which keep it from using vector instructions.
+        return [node + offset for offset in offsets]
+    return node + constant_like(offsets, node).view(8, *[1] * node.ndim)
+
+
+def _along_axes(numbers: Tensor, like: Tensor) -> Tensor:
+    """Numbers (3,) of the axes in a shape that broadcasts with points (3, ...)."""
+    return numbers.view(3, *[1] * (like.ndim - 1))
+
+
+def cells_at(grid: GridShape, points_obj: Tensor) -> Cells:
+    """The cells at points (3, ...). A NaN point gets a valid cell at a distance of NaN and cannot disturb others."""
+    position = positions(grid, points_obj)
+    last = _along_axes(grid.last, position)
+    # `minimum` instead of `clamp_max` would halve derivatives on the last faces.
+    clamped = position.clamp_min(0).clamp_max(last)
+    lower = clamped.detach().floor().minimum(last - 1)
+    return Cells(lower_nodes(grid, lower), clamped - lower, position, clamped)
+
+
+def corner_values(grid: GridShape, node: Tensor) -> Ends:
     """Signed distances (8, ...) at the corners of cells, from their lower nodes (...) among the nodes of all grids."""
-    corners = field.at_corners(node)
+    corners = at_corners(grid, node)
     if isinstance(corners, list):
         # The compiler knows that indices of an embedding are at least 0.
-        return [embedding(corner, field.values[:, None])[..., 0] for corner in corners]
-    return field.values.index_select(0, corners.view(-1)).view(corners.shape)
+        return [embedding(corner, grid.values.reshape(-1, 1))[..., 0] for corner in corners]
+    return grid.values.reshape(-1).index_select(0, corners.view(-1)).view(corners.shape)
 
 
 def halves(ends: Ends) -> tuple[Ends, Ends]:
@@ -295,20 +272,20 @@ def scaled(factor: Tensor, ends: Ends) -> Ends:
     return [factor * end for end in ends] if isinstance(ends, list) else factor * ends
 
 
-def _value_and_gradient(field: GridField, cells: Cells, owner: Tensor, in_grid: bool = False) -> tuple[Tensor, Tensor]:
+def _value_and_gradient(grid: GridShape, cells: Cells, owner: Tensor, in_grid: bool = False) -> tuple[Tensor, Tensor]:
     fx, fy, fz = cells.fraction
-    lower, along_z = halves(corner_values(field, field.nodes_of(cells.lower_node, owner)))
+    lower, along_z = halves(corner_values(grid, nodes_of(grid, cells.lower_node, owner)))
     lower, along_y = halves(moved(lower, fz, along_z))
     lowest, along_x = halves(moved(lower, fy, along_y))
     inside = moved(lowest, fx, along_x)[0]
     along_z = _between(along_z, fy)
     slope = torch.stack([x[0] for x in (along_x, _between(along_y, fx), _between(along_z, fx))])
-    slope = slope * (1 / field.spacing_m)
+    slope = slope * (1 / grid.spacing_m)
     if in_grid:
         return inside, slope
     outward, distance = cells.outward
     gradient = torch.where(outward == 0, slope, outward / distance)
-    return torch.add(inside, distance, alpha=field.spacing_m), gradient
+    return torch.add(inside, distance, alpha=grid.spacing_m), gradient
 
 
 def _between(ends: Ends, fraction: Tensor) -> Ends:
@@ -333,24 +310,24 @@ def _summed(table: Tensor, corners: Tensor, fraction: Tensor) -> Tensor:
 
 
 def _cells_along(
-    field: GridField, owner: Tensor, centre_obj: Tensor, direction_obj: Tensor, depth: Tensor, ahead: float
+    grid: GridShape, owner: Tensor, centre_obj: Tensor, direction_obj: Tensor, depth: Tensor, ahead: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Cells per metre of depth (3, M, R), lower node (M, R) of the cell at a depth, and the place (3, M, R) in it.
 
     A face that is no further than `ahead`, in cells, in front of the place along the ray is behind it.
     """
-    step = direction_obj * (1 / field.spacing_m)
+    step = direction_obj * (1 / grid.spacing_m)
     step = torch.copysign(step.abs().clamp_min(_NO_STEP), step)
-    position = torch.addcmul(field.positions(centre_obj), depth, step)
-    lower = (position + ahead * step.sign()).floor().clamp_min(0).minimum(field.last_nodes(position) - 1)
-    return step, field.nodes_of(field.lower_nodes(lower), owner), position - lower
+    position = torch.addcmul(positions(grid, centre_obj), depth, step)
+    lower = (position + ahead * step.sign()).floor().clamp_min(0).minimum(_along_axes(grid.last, position) - 1)
+    return step, nodes_of(grid, lower_nodes(grid, lower), owner), position - lower
 
 
-def _derivatives_along(field: GridField, node: Tensor, place: Tensor, step: Tensor) -> _AlongRay:
+def _derivatives_along(grid: GridShape, node: Tensor, place: Tensor, step: Tensor) -> _AlongRay:
     """Coefficients of the polynomial along a ray in the cell with lower node (M, R), at a place (3, M, R) in it."""
     (ux, uy, uz), (dx, dy, dz) = place, step
     # The corners are interpolated along z, then y, then x, and each time the polynomial of the distance gains a degree.
-    lower, rise = halves(corner_values(field, node))
+    lower, rise = halves(corner_values(grid, node))
     (a0, rise_0), (a1, rise_1) = halves(moved(lower, uz, rise)), halves(scaled(dz, rise))
     b1 = moved(moved(a1, uy, rise_1), dy, rise_0)
     (_, rise_0), (b1, rise_1), (b2, rise_2) = map(halves, (moved(a0, uy, rise_0), b1, scaled(dy, rise_1)))

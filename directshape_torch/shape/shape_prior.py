@@ -13,10 +13,10 @@ from torch import Tensor
 
 
 class SdfDerivatives(NamedTuple):
-    """`SdfDerivatives` are the value and first derivatives of a signed distance field at P points, from one lookup."""
+    """`SdfDerivatives` are the value and first derivatives of signed distance fields at points, from one lookup."""
 
     value: Tensor  # (P,) metres
-    gradient: Tensor  # (P, 3) d value / d point_obj
+    gradient: Tensor  # d value / d point_obj, in the shape of the points: (P, 3), inside of terms (3, ...)
     J_value_code: Tensor  # (P, K) d value / d code, metres per standard deviation
 
 

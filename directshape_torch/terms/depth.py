@@ -104,12 +104,12 @@ def march(field: Field, owner: Tensor, rays: ObjectRays, bounds_obj: Tensor, num
     depths, crosses = sample_depths(rays, bounds_obj, num_samples)
     at_once = max(1, _POINTS_AT_ONCE // max(1, num_samples * depths.shape[2]))
     if torch.compiler.is_compiling() or len(owner) <= at_once or depths.device.type != "cpu":
-        return March(depths, field.value(rays.at(depths), owner, inside=True), crosses)
+        return March(depths, field.sdf(rays.at(depths), owner, inside=True), crosses)
     parts = []
     for first in range(0, len(owner), at_once):
         some = slice(first, first + at_once)
         points = ObjectRays(rays.centre_obj[:, some], rays.direction_obj[:, some]).at(depths[:, some])
-        parts.append(field.value(points, owner[some], inside=True))
+        parts.append(field.sdf(points, owner[some], inside=True))
     return March(depths, torch.cat(parts, dim=1), crosses)
 
 
@@ -143,7 +143,7 @@ def tracked_closest(field: Field, rays: Rays, in_objects: ObjectRays, bounds_obj
     """The point of closest approach of every ray, near its closest point at a nearby state."""
     next_to = in_objects.depth_next_to(before.points_obj)
     samples = torch.stack([next_to - _SAMPLE_M, next_to, next_to + _SAMPLE_M])
-    sdf = field.value(in_objects.at(samples), rays.owner, inside=True)
+    sdf = field.sdf(in_objects.at(samples), rays.owner, inside=True)
     vertex = _vertex(sdf[0], sdf[1], sdf[2], 1.0)
     # The start moves only to a minimum in another cell, so that a nearby minimum remains the selected one.
     start = torch.add(next_to, vertex * (vertex.abs() > _NEXT_CELL), alpha=_SAMPLE_M)
@@ -213,10 +213,10 @@ def first_hits(field: Field, owner: Tensor, rays: ObjectRays, marched: March, cl
 
     The point of closest approach counts as a sample too, so that thin parts between two samples are found.
     """
-    closest_sdf = field.value(rays.at(closest.depth), owner, inside=True)
+    closest_sdf = field.sdf(rays.at(closest.depth), owner, inside=True)
     bracket, found = _first_bracket(marched, closest.depth, closest_sdf)
     for _ in range(_PROBES):
-        bracket = bracket.probed(field.value(rays.at(bracket.depth), owner, inside=True))
+        bracket = bracket.probed(field.sdf(rays.at(bracket.depth), owner, inside=True))
     depth = torch.where(found, bracket.best, closest.depth)
     points = rays.at(depth)
     normal = field.gradient(points, owner)
@@ -261,12 +261,12 @@ def tracked_depth(field: Field, rays: Rays, in_objects: ObjectRays, before: Hits
     to_plane = ((before.points_obj - in_objects.centre_obj) * before.normal_obj).sum(0) / slope
     next_to = in_objects.depth_next_to(before.points_obj)
     depth = next_to + (to_plane - next_to).clamp(-_MAX_STEP_M, _MAX_STEP_M)
-    sdf = field.value(in_objects.at(depth), rays.owner, inside=True)
+    sdf = field.sdf(in_objects.at(depth), rays.owner, inside=True)
     # The old slope belongs to another point, so after a long step of the car further secants are needed.
     for _ in range(_SECANTS):
         step = -(sdf / slope).clamp(-_MAX_STEP_M, _MAX_STEP_M)
         depth = depth + step
-        before_sdf, sdf = sdf, field.value(in_objects.at(depth), rays.owner, inside=True)
+        before_sdf, sdf = sdf, field.sdf(in_objects.at(depth), rays.owner, inside=True)
         slope = _secant_slope(step, before_sdf, sdf, slope)
     return depth - (sdf / slope).clamp(-_MAX_STEP_M, _MAX_STEP_M)
 

@@ -228,7 +228,7 @@ def near_surface(rays_cam: Rays, field: Field, state: State, where: Surface) -> 
     near = tracked_depth(field, rays_cam, rays, Hits(*where[:2], where.usable, where.depth))
     constant = nothing_is_differentiated()
     if not constant:
-        is_near = field.value(rays.at(near), owner).detach().abs() < NEAR_SURFACE_M
+        is_near = field.sdf(rays.at(near), owner).detach().abs() < NEAR_SURFACE_M
         near = surface_depth(field, owner, rays, near, is_near)
     points = rays.at(near)
     at = field.derivatives(points, owner, constant)
@@ -245,7 +245,7 @@ def depth_of(rays: ObjectRays, owner: Tensor, field: Field, where: Surface) -> T
     """Depth (M, 64) by one Newton step from `where`, with derivatives equal to the ones of `near_surface`."""
     near = rays.depth_next_to(where.points_obj).detach()
     slope = (where.normal_obj * rays.direction_obj).sum(0).detach()
-    step = field.value(rays.at(near), owner) / torch.where(where.usable, slope, -1.0)
+    step = field.sdf(rays.at(near), owner) / torch.where(where.usable, slope, -1.0)
     return near - torch.where(where.usable, step, torch.zeros_like(step))
 
 

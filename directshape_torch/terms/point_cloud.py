@@ -77,7 +77,7 @@ class PointCloud(Term):
         return Linear(residual, torch.ones_like(residual), sdf_state_jacobian(points, at.gradient, at), where)
 
     def residual(self, field: Field, state: State, where: Where) -> Tensor:
-        return field.value(self._points_obj(state), self.points_cam.owner)[..., None]
+        return field.sdf(self._points_obj(state), self.points_cam.owner)[..., None]
 
     def norm(self, residual: Tensor) -> robust.RobustValue:
         return robust.huber(residual, self.huber_m)

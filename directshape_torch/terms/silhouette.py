@@ -23,7 +23,7 @@ from directshape_torch.config import SilhouetteConfig, StageConfig
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.rows import Blocks, CarSums, PixelSamples, Rays, Rows
 from directshape_torch.shape.field import Field
-from directshape_torch.shape.sdf_grid import Lookup
+from directshape_torch.shape.shape_prior import SdfDerivatives
 from directshape_torch.state.cars import CarBatch
 from directshape_torch.state.unknowns import State
 from directshape_torch.terms import robust
@@ -230,7 +230,7 @@ class Silhouettes(Term):
         # At a kink the point stays on its face; at a smooth minimum the depth has no first-order effect.
         off_face = (where.face_obj * (points - where.points_obj)).sum(0)
         depth = where.depth - torch.where(is_kink, off_face / torch.where(is_kink, across, 1.0), 0.0)
-        sdf = field.value(rays.at(depth), self.rows.rays.owner)
+        sdf = field.sdf(rays.at(depth), self.rows.rays.owner)
         return self._of_distance(sdf, where.crosses)[0][..., None]
 
     def norm(self, residual: Tensor) -> robust.RobustValue:
@@ -241,7 +241,7 @@ class Silhouettes(Term):
         return replace(self, cars=cars, rows=rows, zeta=self.zeta.index_select(0, kept))
 
     def _least_distance(self, sight: Sight) -> Tensor:
-        return sight.field.value(sight.closest.points_obj, self.rows.rays.owner)
+        return sight.field.sdf(sight.closest.points_obj, self.rows.rays.owner)
 
     def _of_distance(self, sdf: Tensor, crosses: Tensor) -> tuple[Tensor, Tensor]:
         """Residual (M, R) of least distances, and its derivative; rays outside the bounds have a constant residual."""
@@ -278,7 +278,7 @@ def closest_approach_residual(
 def sdf_state_jacobian(
     points_obj: Tensor,  # (3, M, R) metres
     gradient: Tensor,  # (3, M, R) gradient of the signed distance
-    at: Lookup,
+    at: SdfDerivatives,
 ) -> Tensor:
     """Return `J_sdf_state = [grad, X x grad, basis]` (M, R, 6 + K): per metre, per radian, per standard deviation.
 
@@ -317,7 +317,7 @@ class SilhouetteProducts(Silhouettes):
         else:
             # The samples are constants of this linearisation, but move with the bounds in its derivative.
             depths, crosses = sample_depths(rays, self.bounds_obj, num_samples)
-            sdf = field.value(rays.at(depths), owner)
+            sdf = field.sdf(rays.at(depths), owner)
         residual, J_residual_sdf = product_residual(sdf, self.zeta, self.rows.foreground)
         # The sum goes sample by sample, so that memory holds no Jacobian for each sample.
         J = torch.zeros(0)
@@ -332,7 +332,7 @@ class SilhouetteProducts(Silhouettes):
 
     def residual(self, field: Field, state: State, where: Where) -> Tensor:
         rays = self.rows.rays.in_objects(state.T_obj_cam)
-        sdf = field.value(rays.at(where.depths), self.rows.rays.owner)
+        sdf = field.sdf(rays.at(where.depths), self.rows.rays.owner)
         residual, _ = product_residual(sdf, self.zeta, self.rows.foreground)
         return torch.where(where.crosses, residual, self.rows.residual_of_a_miss())[..., None]
 

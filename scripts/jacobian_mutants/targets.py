@@ -104,7 +104,7 @@ TARGETS: dict[str, Target] = {
     ),
     "ray_minimum": Target(
         "directshape_torch/shape/sdf_grid.py",
-        ("GridField.minimum_along", "GridField.curvature_along", "_cells_along", "_derivatives_along", "_first_root"),
+        ("GridShape.minimum_along", "GridShape.curvature_along", "_cells_along", "_derivatives_along", "_first_root"),
         (
             f"{_LABORATORY}::test_rays_are_closest_where_they_are_said_to_be",
             "tests/shape/test_ray_minimum.py",
@@ -149,7 +149,7 @@ TARGETS: dict[str, Target] = {
     "sdf_grid": Target(
         "directshape_torch/shape/sdf_grid.py",
         (
-            "GridShape.__init__",
+            "GridShape.of",
             "GridShape.value",
             "GridShape.value_and_derivatives",
         ),
@@ -158,9 +158,9 @@ TARGETS: dict[str, Target] = {
     "grid_lookup": Target(
         "directshape_torch/shape/sdf_grid.py",
         (
-            "GridField.value",
-            "GridField.derivatives",
-            "GridField.gradient",
+            "GridShape.sdf",
+            "GridShape.derivatives",
+            "GridShape.gradient",
             "_value_and_gradient",
             "_interpolated",
             "_between",
@@ -171,12 +171,12 @@ TARGETS: dict[str, Target] = {
     "grid_cells": Target(
         "directshape_torch/shape/sdf_grid.py",
         (
-            "GridField.positions",
-            "GridField.last_nodes",
-            "GridField.steps",
-            "GridField.lower_nodes",
-            "GridField.nodes_of",
-            "GridField.at_corners",
+            "positions",
+            "steps",
+            "lower_nodes",
+            "nodes_of",
+            "at_corners",
+            "_along_axes",
             "Cells.outward",
             "cells_at",
             "corner_values",
@@ -244,20 +244,21 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     ),
     Equivalent("warped_depth", "ratio", "(-ratio)", _IN_PAIRS),
     Equivalent("_Layout.of", "terms[0]", "terms[1]", "all terms are of the same cars"),
-    Equivalent("GridField.at_corners", "k * z", "(k)", "the stride of the last axis is one"),
+    Equivalent("at_corners", "k * z", "(k)", "the stride of the last axis is one"),
     *(
-        Equivalent(
-            "GridField.lower_nodes", text, None, "the upper limit is for processors that make NaN a large number"
+        Equivalent("lower_nodes", text, None, "the upper limit is for processors that make NaN a large number")
+        for text in (
+            "math.prod(grid.basis.shape[:3]) - 1",
+            "math.prod(grid.basis.shape[:3]) - 1 - sum(strides(grid))",
         )
-        for text in ("self.num_nodes - 1", "self.num_nodes - 1 - self.steps_to_last_corner")
     ),
     *(
-        Equivalent("GridField.minimum_along", text, f"({wider})", "of a ray beyond the border nothing is used")
+        Equivalent("GridShape.minimum_along", text, f"({wider})", "of a ray beyond the border nothing is used")
         for text, wider in (
-            ("len(self.values) - 1", "len(self.values) + 1"),
-            ("len(self.values) - 1", "len(self.values)"),
-            ("len(self.values) - 1 - self.steps_to_last_corner", "len(self.values) - 1 + self.steps_to_last_corner"),
-            ("len(self.values) - 1 - self.steps_to_last_corner", "len(self.values) - 1"),
+            ("self.values.numel() - 1", "self.values.numel() + 1"),
+            ("self.values.numel() - 1", "self.values.numel()"),
+            ("self.values.numel() - 1 - sum(strides(self))", "self.values.numel() - 1 + sum(strides(self))"),
+            ("self.values.numel() - 1 - sum(strides(self))", "self.values.numel() - 1"),
         )
     ),
     *(
@@ -271,7 +272,7 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
         Equivalent(function, text, f"(-{wrapped})", "of a face's normal over its product with the ray the sign is gone")
         for function, text, wrapped in (
             ("attached_closest_depth", "closest.face_obj", "closest.face_obj"),
-            ("GridField.minimum_along", "1 - goes_on", "(1 - goes_on)"),
+            ("GridShape.minimum_along", "1 - goes_on", "(1 - goes_on)"),
         )
     ),
     Equivalent("_on_the_ground", "R", "(-R)", f"in J_heading_omega it {_IN_PAIRS}"),

@@ -29,8 +29,7 @@ from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.result_files import write_result_text
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.shape.sdf_grid import Lookup
-from directshape_torch.shape.shape_prior import DimensionsDerivative
+from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivatives
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.state.cars import CarState
 from directshape_torch.terms.depth import march
@@ -295,7 +294,8 @@ def test_21_bias_is_measured_minus_true_disparity() -> None:
 
 def test_22_jacobians_are_out_in() -> None:
     gradient, X = vector(0.1, -0.6, 0.7), vector(1.0, -0.8, 0.4)
-    points, at = X.view(3, 1, 1), Lookup(torch.zeros(1, 1), gradient.view(3, 1, 1), torch.zeros(1, 1, 2).double())
+    points = X.view(3, 1, 1)
+    at = SdfDerivatives(torch.zeros(1, 1), gradient.view(3, 1, 1), torch.zeros(1, 1, 2).double())
     J_sdf_point = gradient[None]
     J_point_state = torch.cat([torch.eye(3).double(), -So3.hat(X)], dim=1)  # of v + omega x X
     J_sdf_state = sdf_state_jacobian(points, at.gradient, at)[0]

@@ -43,7 +43,7 @@ def test_views_of_a_track_are_seen_in_the_next(bench_of: BenchOf) -> None:
 def test_pixels_of_a_regime(bench_of: BenchOf, prior: PCAShapePrior) -> None:
     at = bench_of("contour")
     filled = at.problem.masks.filled > 0
-    sdf = at.sight.field.value(at.sight.closest.points_obj, at.problem.masks.rays.owner)
+    sdf = at.sight.field.sdf(at.sight.closest.points_obj, at.problem.masks.rays.owner)
     exponent = (at.terms["silhouettes"].zeta * sdf).abs()[filled]  # type: ignore[attr-defined]
     assert len(exponent) > 5
     assert (exponent < 3).all()

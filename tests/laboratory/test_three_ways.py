@@ -74,7 +74,7 @@ def test_rays_are_closest_where_they_are_said_to_be(bench_of: BenchOf, regime: s
     for at, state, closest in ((bench.sight.field, bench.state, bench.sight.closest), (field, moved, tracked)):
         points = masks.rays.in_objects(state.T_obj_cam).at(closest.depth + offset)
         inside = ((points >= lower + 1e-4) & (points <= upper - 1e-4)).all(0)
-        sdf = at.value(points, masks.rays.owner)
+        sdf = at.sdf(points, masks.rays.owner)
         nearest = torch.where(inside, sdf, torch.inf).amin(0)
         seen = closest.crosses & (masks.filled > 0)
         assert bool((sdf[80] <= nearest + 1e-9)[seen].all())
@@ -142,7 +142,7 @@ def test_a_tracked_pixel_ends_on_the_surface(bench_of: BenchOf) -> None:
     rays = term.pixel_set.rows.rays
     found = photometric.near_surface(rays, field, moved, term.where(bench.sight))
     here, end = (
-        field.value(points, rays.owner)[found.found].abs() for points in (found.points_obj, found.rays.at(found.depth))
+        field.sdf(points, rays.owner)[found.found].abs() for points in (found.points_obj, found.rays.at(found.depth))
     )
     assert float(here.max()) > 1e-5
     assert float(end.mean()) < 0.3 * float(here.mean())

@@ -33,7 +33,7 @@ def test_mask_overlap_is_that_of_rays_through_the_shape() -> None:
     rays = masks.rays.in_objects(state.T_obj_cam)
     inside = rays.interval(problem.prior.bounds_obj)
     depths = inside.near + torch.linspace(0, 1, 400)[:, None, None] * (inside.far - inside.near)
-    covered = (seen.field.value(rays.at(depths), masks.rays.owner) < 0).any(dim=0) & inside.hit
+    covered = (seen.field.sdf(rays.at(depths), masks.rays.owner) < 0).any(dim=0) & inside.hit
     for side in range(2):
         for car in range(2):
             mine = (masks.filled > 0) & ((masks.rays.owner == car) & (masks.side == side))[:, None]

@@ -53,7 +53,7 @@ class Transposed(GridShape):
 class TransposedCodeDerivative(Wrapped):
     def bind(self, code: Tensor) -> Transposed:
         shape = self.inner.bind(code)
-        return Transposed(shape.values, shape.basis, shape.origin, shape.spacing_m)
+        return Transposed(*shape)
 
 
 class Detached(Wrapped):
@@ -74,7 +74,7 @@ class DetachedGradient(Wrapped):
 
     def bind(self, code: Tensor) -> DetachedShape:
         shape = self.inner.bind(code)
-        return DetachedShape(shape.values, shape.basis, shape.origin, shape.spacing_m)
+        return DetachedShape(*shape)
 
 
 def test_a_wrapped_prior_without_fault_is_taken() -> None:

@@ -1,4 +1,4 @@
-"""The least signed distance along rays agrees with the reference for grids and other shapes, with derivative."""
+"""The least signed distance along rays through grids and other shapes, against the reference, and its derivative."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from directshape_torch.geometry import se3
 from directshape_torch.rows import ObjectRays, Rays
 from directshape_torch.shape.field import Field, PackedField, field_of
-from directshape_torch.shape.sdf_grid import GridField, GridShape, RayMinimum, _AlongRay, _first_root
+from directshape_torch.shape.sdf_grid import GridShape, RayMinimum, _AlongRay, _first_root
 from directshape_torch.shape.shape_prior import BoundShape
 from directshape_torch.terms.depth import (
     Bracket,
@@ -68,7 +68,7 @@ def test_minimum_and_first_hit_are_the_references(kind: str, monkeypatch: pytest
     near, far = torch.where(crosses, near, 1.0), torch.where(crosses, far, 2.0)
     distance = slow.along(shape)
     expected = distance(least(distance, near, far)[:, None])[:, 0]
-    found = field.value(closest.points_obj, rays.owner).flatten()
+    found = field.sdf(closest.points_obj, rays.owner).flatten()
     error = (found - expected)[crosses]
     assert error.min() > -1e-7
     # Two minima of nearly the same distance: the nearest sample tells which one is followed.
@@ -264,10 +264,10 @@ def test_the_best_depth_is_the_one_of_least_distance() -> None:
     assert torch.equal(bracket.best, near)
 
 
-def _grid(values: Tensor) -> GridField:
-    """A grid with distances (nx, ny) at nodes 0.1 m apart, equal for all z."""
+def _grid(values: Tensor) -> GridShape:
+    """The grid has distances (nx, ny) at nodes 0.1 m apart, equal for all z."""
     nodes = values.double()[None, ..., None].expand(1, *values.shape, 3).contiguous()
-    return GridShape(nodes, torch.zeros(*values.shape, 3, 1).double(), torch.zeros(3).double(), 0.1).field
+    return GridShape.of(nodes, torch.zeros(*values.shape, 3, 1).double(), torch.zeros(3).double(), 0.1)
 
 
 def test_a_search_ends_where_it_began_beside_another_face() -> None:

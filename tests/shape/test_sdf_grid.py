@@ -13,14 +13,15 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.shape.field import field_of
-from directshape_torch.shape.sdf_grid import GridField, GridShape, Lookup
+from directshape_torch.shape.sdf_grid import GridShape
+from directshape_torch.shape.shape_prior import SdfDerivatives
 from directshape_torch.shape.zero_level import zero_level_extents
 
 ORIGIN = torch.tensor([-1.0, -2.0, 0.5], dtype=torch.float64)
 SPACING = 0.4
 COUNTS = (6, 5, 4)
 LAST = ORIGIN + SPACING * (torch.tensor(COUNTS, dtype=torch.float64) - 1)
-LookUp = Callable[[GridField, Tensor, Tensor], Lookup]
+LookUp = Callable[[GridShape, Tensor, Tensor], SdfDerivatives]
 
 
 @pytest.fixture(params=["to be differentiated", "constant", "as a compiler traces it"])
@@ -40,7 +41,7 @@ def grids(num_objects: int, num_codes: int) -> tuple[Tensor, Tensor]:
 
 def random_shape(num_objects: int = 2, num_codes: int = 3, dtype: torch.dtype = torch.float64) -> GridShape:
     values, basis = grids(num_objects, num_codes)
-    return GridShape(values.to(dtype), basis.to(dtype), ORIGIN.to(dtype), SPACING)
+    return GridShape.of(values.to(dtype), basis.to(dtype), ORIGIN.to(dtype), SPACING)
 
 
 def points(count: int = 75, stretch: float = 1.6) -> Tensor:
@@ -71,7 +72,7 @@ def test_value_and_derivatives_against_a_slow_loop(look_up: LookUp, num_codes: i
     at[:2] = torch.stack([ORIGIN, ORIGIN + SPACING * torch.tensor([2.0, 1.0, 3.0])])
     owner = torch.tensor([0, 2, 1])
     blocks = at.view(3, 25, 3).movedim(-1, 0)
-    found, values = look_up(shape.field, blocks, owner), shape.field.value(blocks, owner)
+    found, values = look_up(shape, blocks, owner), shape.sdf(blocks, owner)
     for i, point in enumerate(at):
         value = slow_lookup(grid[owner[i // 25]], point)
         torch.testing.assert_close(found.value[i // 25, i % 25], value)
@@ -81,16 +82,16 @@ def test_value_and_derivatives_against_a_slow_loop(look_up: LookUp, num_codes: i
 
 @pytest.mark.parametrize("stretch", [1.0, 3.0])
 def test_gradient_is_the_derivative_of_the_value(look_up: LookUp, stretch: float) -> None:
-    field, owner = random_shape().field, torch.arange(2)
+    field, owner = random_shape(), torch.arange(2)
     at = points(40, stretch).mT.reshape(3, 2, 20).requires_grad_()
-    (by_autograd,) = torch.autograd.grad(field.value(at, owner).sum(), at)
+    (by_autograd,) = torch.autograd.grad(field.sdf(at, owner).sum(), at)
     found = look_up(field, at, owner)
     torch.testing.assert_close(found.gradient, by_autograd, rtol=1e-12, atol=1e-12)
     (other,) = torch.autograd.grad(found.value.sum(), at)
     torch.testing.assert_close(other, by_autograd, rtol=1e-12, atol=1e-12)
     if stretch == 1:  # no point is outside, which may be said
         within = field.derivatives(at, owner, inside=True)
-        for mine, theirs in zip((*within, field.value(at, owner, inside=True)), (*found, found.value), strict=True):
+        for mine, theirs in zip((*within, field.sdf(at, owner, inside=True)), (*found, found.value), strict=True):
             torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-12)
     else:
         torch.testing.assert_close(field.gradient(at, owner), found.gradient, rtol=1e-12, atol=1e-12)
@@ -99,7 +100,7 @@ def test_gradient_is_the_derivative_of_the_value(look_up: LookUp, stretch: float
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_shape_looks_up_packed_points(dtype: torch.dtype) -> None:
     shape, at, index = random_shape(dtype=dtype), points().to(dtype), torch.arange(75) % 2
-    expected, found = shape.field.derivatives(at.mT[..., None], index), shape.value_and_derivatives(at, index)
+    expected, found = shape.derivatives(at.mT[..., None], index), shape.value_and_derivatives(at, index)
     torch.testing.assert_close(found.value, expected.value[:, 0], rtol=0, atol=0)
     torch.testing.assert_close(found.gradient.mT, expected.gradient[..., 0], rtol=0, atol=0)
     torch.testing.assert_close(found.J_value_code, expected.J_value_code[:, 0], rtol=0, atol=0)
@@ -110,9 +111,21 @@ def test_a_shape_looks_up_packed_points(dtype: torch.dtype) -> None:
     assert shape.value(at[:0], index[:0]).shape == (0,)
 
 
+class Raised(GridShape):
+    def value(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
+        return super().value(points_obj, object_index) + 1
+
+
+def test_terms_ask_a_class_made_of_grids_for_its_own_values() -> None:
+    shape, blocks, owner = random_shape(3), points().view(3, 25, 3).movedim(-1, 0), torch.tensor([0, 2, 1])
+    assert field_of(shape) is shape
+    found = field_of(Raised(*shape)).sdf(blocks, owner)
+    torch.testing.assert_close(found, shape.sdf(blocks, owner) + 1, rtol=1e-12, atol=1e-12)
+
+
 def test_the_last_faces_belong_to_their_cells() -> None:
     shape, index = random_shape(1), torch.zeros(3, dtype=torch.long)
-    shape = GridShape(shape.values, shape.basis, torch.zeros(3, dtype=torch.float64), 0.5)
+    shape = GridShape.of(shape.values, shape.basis, torch.zeros(3, dtype=torch.float64), 0.5)
     at = torch.tensor([[2.5, 0.7, 0.3], [0.2, 2.0, 0.3], [0.2, 0.3, 1.5]], dtype=torch.float64, requires_grad=True)
     (by_autograd,) = torch.autograd.grad(shape.value(at, index).sum(), at)
     torch.testing.assert_close(shape.value_and_derivatives(at, index).gradient, by_autograd)
@@ -120,7 +133,7 @@ def test_the_last_faces_belong_to_their_cells() -> None:
 
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
 def test_points_that_are_not_finite_disturb_no_others(look_up: LookUp, bad: float) -> None:
-    field, at, owner = random_shape().field, points(20).mT.reshape(3, 20, 1).contiguous(), torch.arange(20) % 2
+    field, at, owner = random_shape(), points(20).mT.reshape(3, 20, 1).contiguous(), torch.arange(20) % 2
     clean = look_up(field, at, owner)
     at[1, 7] = bad
     broken = look_up(field, at, owner)
@@ -134,7 +147,7 @@ def test_traced_lookups_have_the_same_gradients(monkeypatch: pytest.MonkeyPatch)
     """By the points, the values and the basis, through value, gradient and code derivative."""
 
     def gradients() -> tuple[Tensor, ...]:
-        field, owner = random_shape().field, torch.arange(3) % 2
+        field, owner = random_shape(), torch.arange(3) % 2
         inputs = [x.clone().requires_grad_() for x in (points().mT.reshape(3, 3, 25), field.values, field.basis)]
         at = field._replace(values=inputs[1], basis=inputs[2]).derivatives(inputs[0], owner)
         total = sum((x * torch.linspace(-1, 1, x.numel(), dtype=x.dtype).view_as(x)).sum() for x in at)
@@ -166,7 +179,7 @@ def test_differentiation_needs_no_gradient_mode(by: str) -> None:
 
 
 def test_the_gradient_can_be_traced() -> None:
-    field, at, owner = random_shape().field, points(20).mT.reshape(3, 2, 10), torch.arange(2)
+    field, at, owner = random_shape(), points(20).mT.reshape(3, 2, 10), torch.arange(2)
     traced = torch.compile(field.gradient, backend="eager", fullgraph=True)
     torch.testing.assert_close(traced(at, owner), field.gradient(at, owner), rtol=1e-12, atol=1e-12)
 
@@ -184,7 +197,7 @@ def test_curvature_along_rays_by_differences() -> None:
     centre = middle.view(3, 1, 1) - direction
     step = torch.tensor([-0.01, 0.0, 0.01], dtype=torch.float64).view(3, 1, 1)
     points = centre[:, None] + (1 + step) * direction[:, None]
-    before, here, after = field_of(shape).value(points, OWNERS)
+    before, here, after = field_of(shape).sdf(points, OWNERS)
     depth = torch.ones(3, 64, dtype=torch.float64)
     for block in range(64):
         one = slice(block, block + 1)

@@ -146,7 +146,7 @@ def _is_hit(uv: Tensor, depth_m: float, contour_px: float, form: str) -> Tensor:
     if form == "product":
         return (product(marched.sdf, zeta, sure.double()) < math.log(2))[0]
     points = closest_of_march(field, owner, rays, CAR.bounds, marched).points_obj
-    return (closest(field.value(points, owner), zeta, sure.double()) < math.log(2))[0]
+    return (closest(field.sdf(points, owner), zeta, sure.double()) < math.log(2))[0]
 
 
 def _true_contour(depth_m: float) -> tuple[Tensor, Tensor]:
