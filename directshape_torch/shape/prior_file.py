@@ -3,43 +3,24 @@
 from __future__ import annotations
 
 import json
-import math
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from directshape_torch.errors import DataFormatError, InputError, PriorWarning, UnlikelyMeshError, shown
+from directshape_torch.errors import DataFormatError, InputError, shown
 from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.files.read_files import parse_json, read_bytes
 from directshape_torch.numerics.checks import check_type
-from directshape_torch.shape.car_looks import check_looks
-from directshape_torch.shape.outlines import Outlines
 
 # The description is JSON text under one key, because the order of several keys in the file is not fixed.
 _KEY = "description"
 _NOT_WHOLE = "not a whole safetensors file"
-# Cells of this size show the road between the wheels.
-_FINE_M = 0.05
 
-
-class _MadePrior(Protocol):
-    """This is the part of a prior that the check of its looks needs."""
-
-    @property
-    def spacing_m(self) -> float: ...
-
-    def initial_code(self, num_objects: int) -> Tensor: ...
-
-    def values(self, code: Tensor) -> Tensor: ...
-
-
-_PriorT = TypeVar("_PriorT", bound=_MadePrior)
+_PriorT = TypeVar("_PriorT")
 
 
 @dataclass(frozen=True)
@@ -75,8 +56,6 @@ def read_prior(
 ) -> _PriorT:
     """The prior that `make` makes of the tensors (float32 on the CPU), the provenance and the settings in a file.
 
-    A `PriorWarning` is given where the mean shape of a prior of cars does not look like a car.
-
     Raises:
         DataFormatError: the file is missing, truncated or of another schema, has values that are not finite numbers,
             or has tensors and settings that do not fit together.
@@ -84,27 +63,9 @@ def read_prior(
     tensors, description = _read_tensors(Path(path), schema, cure)
     try:
         provenance = PriorProvenance(**description["provenance"])
-        prior = make(tensors, provenance, description)
+        return make(tensors, provenance, description)
     except (InputError, KeyError, TypeError, ValueError, RuntimeError) as problem:
         raise DataFormatError(path, f"it describes no shape prior: {problem!r}", cure=cure) from problem
-    if provenance.of_cars:
-        _warn_of_looks(path, prior)
-    return prior
-
-
-@torch.no_grad()
-def _warn_of_looks(path: Path | str, prior: _MadePrior) -> None:
-    """Warn where the mean shape does not look like a car with x forward and y down, in metres."""
-    values, times = prior.values(prior.initial_code(1)), max(math.ceil(prior.spacing_m / _FINE_M - 1e-6), 1)
-    if times > 1:
-        nodes = [times * (count - 1) + 1 for count in values.shape[1:]]
-        values = functional.interpolate(values[None], nodes, mode="trilinear", align_corners=True)[0]
-    outlines = Outlines.of_solid((values[0] < 0).numpy(), prior.spacing_m / times)
-    try:
-        check_looks(outlines, "+x", "-y", name=f"{path}, mean shape")
-    except UnlikelyMeshError as problem:
-        cure = "build it anew, with --not-cars (PriorProvenance.of_cars) if it is of another class"
-        warnings.warn(f"{problem.found}; {cure}", PriorWarning, stacklevel=5)
 
 
 def read_description(path: Path, cure: str = "") -> dict[str, Any]:

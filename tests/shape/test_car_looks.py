@@ -17,6 +17,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from directshape_torch.errors import DataFormatError, MeshError, PriorWarning, UnlikelyMeshError
+from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf, place_mesh
 from directshape_torch.shape.outlines import AXES
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -195,15 +196,15 @@ def changed(folder: Path, *axes: int, provenance: dict[str, object] | None = Non
 
 
 def test_files_of_priors_that_do_not_look_like_cars_warn(tmp_path: Path) -> None:
-    PCAShapePrior.load(changed(tmp_path))
+    load_prior(changed(tmp_path))
     for axes, looks in (((0,), "driving backwards"), ((1,), "upside down")):
         with pytest.warns(PriorWarning, match=f"mean shape: .* it looks like a car {looks}; build it anew"):
-            PCAShapePrior.load(changed(tmp_path, *axes))
-    PCAShapePrior.load(changed(tmp_path, 1, provenance={"of_cars": False}))
+            load_prior(changed(tmp_path, *axes))
+    load_prior(changed(tmp_path, 1, provenance={"of_cars": False}))
     prior = PCAShapePrior.load_bundled()
     prior.spacing_m /= 4
     prior.save(tmp_path / "small.safetensors")
     with pytest.warns(PriorWarning, match=r"small.safetensors, mean shape: 0\.9.* m long"):
-        PCAShapePrior.load(tmp_path / "small.safetensors")
+        load_prior(tmp_path / "small.safetensors")
     with pytest.raises(DataFormatError, match="no shape prior"):
-        PCAShapePrior.load(changed(tmp_path, provenance={"of_cars": "no"}))
+        load_prior(changed(tmp_path, provenance={"of_cars": "no"}))
