@@ -13,8 +13,9 @@ from torch import Tensor
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.projection import depth_from_disparity, rays_from_pixels
+from directshape_torch.geometry.projection import rays_from_pixels
 from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.geometry.stereo_depth import depth_from_disparity
 from directshape_torch.io.image_files import read_disparity, read_single_channel
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_labels import KittiObject

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.geometry.box3d import BOX_EDGES, box_corners
-from directshape_torch.geometry.projection import project, rays_from_pixels, warp_to_right
+from directshape_torch.geometry.projection import project, rays_from_pixels
 from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.geometry.stereo_depth import warp_to_right
 
 _NEAR_PLANE_M = 0.5
 

@@ -7,8 +7,8 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from directshape_torch.geometry.projection import depth_from_disparity, disparity_of_depth
 from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.geometry.stereo_depth import depth_from_disparity, disparity_of_depth
 from directshape_torch.scene import FrameBatch
 
 

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, polynomial_basis
-from directshape_torch.geometry.projection import rays_from_pixels, warp_to_right
+from directshape_torch.geometry.projection import rays_from_pixels
+from directshape_torch.geometry.stereo_depth import warp_to_right
 from directshape_torch.rig.pixels import COEFFICIENT_SIGMA_PX, PixelEvidence, by_degree, pixel_evidence, tukey_weight
 from directshape_torch.rig.rig import Rig
 from directshape_torch.stereo_matching.patch_alignment import MatchedPair

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.image_boxes import box_iou
-from directshape_torch.geometry.projection import depth_from_disparity
+from directshape_torch.geometry.stereo_depth import depth_from_disparity
 from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence
 from directshape_torch.scene_check.conventions import projected_boxes
 from directshape_torch.scene_check.finding import Finding, Severity, found, of_cars

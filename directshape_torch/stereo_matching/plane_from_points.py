@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.geometry.projection import points_from_disparity
 from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.geometry.stereo_depth import points_from_disparity
 from directshape_torch.stereo_matching.disparity import match_disparity
 
 _DEPTH_RANGE_M = (3.0, 40.0)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.errors import InputError
-from directshape_torch.geometry.projection import points_from_disparity
+from directshape_torch.geometry.stereo_depth import points_from_disparity
 from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.rows import PointSamples

@@ -138,8 +138,11 @@ TARGETS: dict[str, Target] = {
     "offset": Target("directshape_torch/state/cars.py", ("CarBatch.inverse_depth_of_offset",), _OFFSET),
     "projection": Target(
         "directshape_torch/geometry/projection.py",
-        ("rays_from_pixels", "project", "warp_to_right", "right_rays"),
+        ("rays_from_pixels", "project", "right_rays"),
         ("tests/geometry/test_stereo.py",),
+    ),
+    "stereo_depth": Target(
+        "directshape_torch/geometry/stereo_depth.py", ("warp_to_right",), ("tests/geometry/test_stereo.py",)
     ),
     "bilinear": Target(
         "directshape_torch/image/interpolate.py",

@@ -22,7 +22,8 @@ from kornia.geometry.liegroup import So3
 from torch import Tensor
 
 from directshape_torch.geometry import box3d, se3
-from directshape_torch.geometry.projection import project, rays_from_pixels, right_rays, warp_to_right
+from directshape_torch.geometry.projection import project, rays_from_pixels, right_rays
+from directshape_torch.geometry.stereo_depth import warp_to_right
 from directshape_torch.image.grey_levels import grey_levels, halve
 from directshape_torch.io.kitti_calibration import KittiCalibration, plane_ref_to_cam, read_plane, to_stereo_camera
 from directshape_torch.io.kitti_labels import read_objects

@@ -24,7 +24,7 @@ from directshape_torch.evaluation import matching
 from directshape_torch.evaluation.evaluate_shapes import ShapeScores, evaluate_shapes
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.geometry.projection import depth_from_disparity
+from directshape_torch.geometry.stereo_depth import depth_from_disparity
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import poses_cam, read_objects
 from directshape_torch.io.result_files import read_shapes, write_shapes

@@ -7,7 +7,8 @@ import torch
 from helpers.derivatives import central_differences
 
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.projection import project, rays_from_pixels, right_rays, warp_to_right
+from directshape_torch.geometry.projection import project, rays_from_pixels, right_rays
+from directshape_torch.geometry.stereo_depth import warp_to_right
 
 K_LEFT = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 K_RIGHT = torch.tensor([[710.0, 0.3, 590.0], [0.0, 705.0, 176.0], [0.0, 0.0, 1.0]], dtype=torch.float64)

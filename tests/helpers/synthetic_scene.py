@@ -12,8 +12,9 @@ from torch import Tensor
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.geometry.ground_plane import GroundPlane
-from directshape_torch.geometry.projection import disparity_of_depth, project, rays_from_pixels, right_rays
+from directshape_torch.geometry.projection import project, rays_from_pixels, right_rays
 from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.geometry.stereo_depth import disparity_of_depth
 from directshape_torch.laboratory.scenes import select_detections
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior

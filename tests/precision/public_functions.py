@@ -32,7 +32,7 @@ from directshape_torch import (
     load_config,
 )
 from directshape_torch.evaluation import pose_error, rotated_iou
-from directshape_torch.geometry import box3d, box_formats, disparity_field, image_boxes, projection, se3
+from directshape_torch.geometry import box3d, box_formats, disparity_field, image_boxes, projection, se3, stereo_depth
 from directshape_torch.shape import pca_fit, zero_level
 from directshape_torch.shape.neural_prior import NeuralShapePrior
 from directshape_torch.shape.prior_file import PriorProvenance
@@ -264,11 +264,11 @@ CASES: dict[str, Case] = {
     "se3.from_kornia": lambda n: se3.from_kornia(se3.to_kornia(n.T)),
     "projection.rays_from_pixels": lambda n: projection.rays_from_pixels(n.uv, n.K),
     "projection.project": lambda n: projection.project(n.points, n.K),
-    "projection.warp_to_right": lambda n: projection.warp_to_right(n.points, n.depth, n.K, n.T_right_cam, n.depth),
+    "stereo_depth.warp_to_right": lambda n: stereo_depth.warp_to_right(n.points, n.depth, n.K, n.T_right_cam, n.depth),
     "projection.right_rays": lambda n: projection.right_rays(n.uv, n.K, n.T_right_cam, n.depth, n.depth),
-    "projection.disparity_of_depth": lambda n: projection.disparity_of_depth(n.uv, n.depth, *rig(n)),
-    "projection.depth_from_disparity": lambda n: projection.depth_from_disparity(n.uv, n.depth, *rig(n), field(n)),
-    "projection.points_from_disparity": lambda n: projection.points_from_disparity(n.uv, n.depth, *rig(n)),
+    "stereo_depth.disparity_of_depth": lambda n: stereo_depth.disparity_of_depth(n.uv, n.depth, *rig(n)),
+    "stereo_depth.depth_from_disparity": lambda n: stereo_depth.depth_from_disparity(n.uv, n.depth, *rig(n), field(n)),
+    "stereo_depth.points_from_disparity": lambda n: stereo_depth.points_from_disparity(n.uv, n.depth, *rig(n)),
     "box3d.rotation_about_y": lambda n: box3d.rotation_about_y(n.depth),
     "box3d.pose_from_kitti": lambda n: box3d.pose_from_kitti(n.points, n.depth),
     "box3d.rotation_y_from_pose": lambda n: box3d.rotation_y_from_pose(n.T),

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField, polynomial_basis
-from directshape_torch.geometry.projection import disparity_of_depth, project, rays_from_pixels
+from directshape_torch.geometry.projection import project, rays_from_pixels
 from directshape_torch.geometry.se3 import exp
 from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.geometry.stereo_depth import disparity_of_depth
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.motion import MotionConstraint
 from directshape_torch.rig.rig import Rig

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.geometry.projection import depth_from_disparity, disparity_of_depth, points_from_disparity
+from directshape_torch.geometry.stereo_depth import depth_from_disparity, disparity_of_depth, points_from_disparity
 from directshape_torch.stereo_matching.plane_from_points import fit_ground_plane
 
 K_LEFT = torch.tensor([[721.5, 0.0, 609.6], [0.0, 721.5, 172.9], [0.0, 0.0, 1.0]], dtype=torch.float64)
