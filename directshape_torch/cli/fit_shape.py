@@ -24,7 +24,7 @@ from directshape_torch.cli.options import add_layout_options
 from directshape_torch.errors import InputError
 from directshape_torch.files.array_files import write_npz
 from directshape_torch.files.atomic_files import check_folder, write_bytes, write_text
-from directshape_torch.files.read_files import finite_numbers, read_lines
+from directshape_torch.files.text_files import finite_numbers, read_lines
 from directshape_torch.geometry.box_formats import BoxFormat
 from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.io.velodyne import read_points

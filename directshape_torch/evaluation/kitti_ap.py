@@ -117,7 +117,7 @@ def score_frames(
 
     Examples:
         >>> from directshape_torch.io.kitti_labels import parse_object
-        >>> from directshape_torch.files.read_files import Line
+        >>> from directshape_torch.files.text_files import Line
         >>> text = "Car 0 0 0 100 100 200 180 1.5 1.6 3.9 1 1.6 20 0"
         >>> label, result = (parse_object("a file", Line(1, t, t)) for t in (text, text + " 0.9"))
         >>> score_frames([([label], [result])]).score("3d", 0.7, "easy").ap_area

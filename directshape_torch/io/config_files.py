@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar
 
 from directshape_torch.config import RefinerConfig, Settings
 from directshape_torch.errors import ConfigError, shown
-from directshape_torch.files.read_files import read_text
+from directshape_torch.files.text_files import read_text
 
 BUNDLED_CONFIGS = ("default", "paper", "fast", "geometric", "combined")
 """These are the names of the settings that come with the package, for `load_config`."""

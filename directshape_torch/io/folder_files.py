@@ -16,8 +16,9 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, shown
-from directshape_torch.files.read_files import Line, read_json
+from directshape_torch.files.read_files import read_json
 from directshape_torch.files.schema import record_of
+from directshape_torch.files.text_files import Line
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.image_boxes import project_boxes
 from directshape_torch.io.instance_masks import (

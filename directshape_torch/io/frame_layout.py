@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.files.find_files import composed, found, is_called, visible_files
-from directshape_torch.files.read_files import is_frame_id, read_lines
+from directshape_torch.files.find_files import composed, found, is_called, is_frame_id, visible_files
+from directshape_torch.files.text_files import read_lines
 from directshape_torch.io import folder_files
 from directshape_torch.io.image_files import IMAGE_ENDINGS
 from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration, read_plane, read_velo_to_cam

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.files.read_files import Line, finite_numbers, read_lines
+from directshape_torch.files.text_files import Line, finite_numbers, read_lines
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
 

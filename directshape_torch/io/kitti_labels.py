@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.files.find_files import is_called
-from directshape_torch.files.read_files import Line, finite_numbers, read_lines, remembered
+from directshape_torch.files.find_files import is_called, remembered
+from directshape_torch.files.text_files import Line, finite_numbers, read_lines
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.instance_masks import file_of_frame
 

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError, shown
-from directshape_torch.files.find_files import visible_files
-from directshape_torch.files.read_files import Line, read_json, read_lines, remembered
+from directshape_torch.files.find_files import remembered, visible_files
+from directshape_torch.files.read_files import read_json
+from directshape_torch.files.text_files import Line, read_lines
 from directshape_torch.io import folder_files
 from directshape_torch.io.frame_layout import FrameLayout
 from directshape_torch.io.image_files import find_image, read_single_channel

@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.files.read_files import Line, finite_numbers, read_lines, remembered
+from directshape_torch.files.find_files import remembered
+from directshape_torch.files.text_files import Line, finite_numbers, read_lines
 from directshape_torch.numerics.checks import is_no_rotation
 
 

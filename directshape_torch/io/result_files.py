@@ -38,7 +38,7 @@ def result_line(source: KittiObject, refined: RefinedBox) -> str:
 
     Examples:
         >>> from directshape_torch.io.kitti_labels import parse_object
-        >>> from directshape_torch.files.read_files import Line
+        >>> from directshape_torch.files.text_files import Line
         >>> raw = "Car -1 -1 0.1 5.25 6 70 80.5 1.5 1.6 3.9 1 1.6 20 0 0.930"
         >>> box = (-0.0363, 1.4, 1.7, 4.1, 1.1, 1.65, 19.5, 0.02)
         >>> result_line(parse_object("results", Line(1, raw, raw)), box)

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import ConfigError, DataFormatError
-from directshape_torch.files.read_files import is_frame_id, parse_json, read_bytes
+from directshape_torch.files.find_files import is_frame_id
+from directshape_torch.files.read_files import parse_json, read_bytes
 from directshape_torch.files.schema import record_of
 from directshape_torch.geometry.box3d import rotation_about_y
 from directshape_torch.io.config_files import config_from_mapping

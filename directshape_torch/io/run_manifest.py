@@ -17,7 +17,8 @@ from torch import Tensor
 
 from directshape_torch.errors import DataFormatError, ResumeError, shown
 from directshape_torch.files import atomic_files
-from directshape_torch.files.read_files import is_frame_id, read_bytes, read_json, remembered
+from directshape_torch.files.find_files import is_frame_id, remembered
+from directshape_torch.files.read_files import read_bytes, read_json
 from directshape_torch.files.schema import check_type, record_of
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.shape.shape_prior import ShapePrior

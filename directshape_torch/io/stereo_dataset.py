@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.errors import DirectShapeError, InputError, shown
-from directshape_torch.files.read_files import is_frame_id
+from directshape_torch.files.find_files import is_frame_id
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.ground_plane import GroundPlane
 from directshape_torch.geometry.stereo_camera import StereoCamera

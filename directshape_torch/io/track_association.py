@@ -44,7 +44,7 @@ def associate(frames: Sequence[Sequence[KittiObject]]) -> list[list[int]]:
 
     Examples:
         >>> from directshape_torch.io.kitti_labels import parse_object
-        >>> from directshape_torch.files.read_files import Line
+        >>> from directshape_torch.files.text_files import Line
         >>> def car(u): return parse_object("f", Line(1, f"Car 0 0 0 {u} 9 {u + 40} 49 1.5 1.6 3.9 1 1.6 20 0", ""))
         >>> associate([[car(100), car(300)], [car(290), car(110)], [car(120), car(600)]])
         [[0, 1], [1, 0], [0, 2]]

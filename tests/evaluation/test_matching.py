@@ -3,7 +3,7 @@
 import pytest
 
 from directshape_torch.evaluation.matching import is_counted, match_to_labels
-from directshape_torch.files.read_files import Line
+from directshape_torch.files.text_files import Line
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
 
 

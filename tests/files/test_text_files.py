@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.files.read_files import read_json, read_lines, read_text
+from directshape_torch.files.read_files import read_json
+from directshape_torch.files.text_files import read_lines, read_text
 
 MARKED = ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-32-be"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from directshape_torch.evaluation.kitti_ap import ApScore, KittiScores, score_frames
-from directshape_torch.files.read_files import Line
+from directshape_torch.files.text_files import Line
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
 
 

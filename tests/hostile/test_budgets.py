@@ -19,7 +19,8 @@ from safetensors.torch import load_file, save_file
 from directshape_torch.errors import ConfigError, DataFormatError, DirectShapeError
 from directshape_torch.files.array_files import read_npy, read_npz
 from directshape_torch.files.mesh_files import read_mesh
-from directshape_torch.files.read_files import read_bytes, read_json, read_lines, read_text
+from directshape_torch.files.read_files import read_bytes, read_json
+from directshape_torch.files.text_files import read_lines, read_text
 from directshape_torch.io.config_files import load_config
 from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.instance_masks import decode_segmentation

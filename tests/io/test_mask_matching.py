@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from directshape_torch.files.read_files import Line
+from directshape_torch.files.text_files import Line
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.image_boxes import project_boxes
 from directshape_torch.geometry.stereo_camera import StereoCamera

@@ -11,7 +11,7 @@ import pytest
 from helpers.layouts import SEQUENCE, write, write_folder, write_sequence, write_tracked
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.files.read_files import Line
+from directshape_torch.files.text_files import Line
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.kitti_labels import KittiObject, parse_object, read_tracking_objects
 from directshape_torch.io.stereo_dataset import open_dataset

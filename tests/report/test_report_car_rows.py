@@ -10,7 +10,7 @@ from helpers.shape_arrays import shape_arrays
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from directshape_torch.files.read_files import Line
+from directshape_torch.files.text_files import Line
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
 from directshape_torch.io.run_folder import FrameRecord, FrameResult
 from directshape_torch.report.car_rows import CarRow, car_gains, car_rows, choose_frames
