@@ -13,7 +13,7 @@ from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig, RefinerConfig, RigConfig
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses, is_z_up
+from directshape_torch.geometry.box_formats import BoxFormat, box_form, boxes_to_poses
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.numerics.checks import check_shape
 from directshape_torch.numerics.conversion import Given, as_floating
@@ -110,7 +110,7 @@ def fit_shape(
     kept = torch.where(fitted.refined[:, None, None], T_points_cam @ fitted.T_cam_obj, T_points_obj)
     J_points_cam = torch.eye(4).to(fitted.covariance_xyz_yaw).repeat(len(kept), 1, 1)
     J_points_cam[:, :3, :3] = T_points_cam[:, :3, :3]
-    J_points_cam[:, 3, 3] = -1 if is_z_up(convention) else 1
+    J_points_cam[:, 3, 3] = -1 if box_form(convention).upright else 1
     covariance = J_points_cam @ fitted.covariance_xyz_yaw @ J_points_cam.mT
     # The masks are artificial, so their IoU means nothing.
     quality = replace(fitted.quality, mask_iou_left=torch.full_like(fitted.quality.mask_iou_left, torch.nan))

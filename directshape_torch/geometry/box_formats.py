@@ -56,7 +56,7 @@ class BoxForm:
     Attributes:
         sizes: order of height, width and length.
         raised: share of the height by which the location lies above the bottom.
-        upright: whether z is up; else the axes are a camera's.
+        upright: whether z is up and headings turn about it; else the axes are a camera's, and they turn about y, down.
         corners: signs of the corners along the object's axes.
         frame: axes of the frame, in words.
         heading: meaning of the heading, in words.
@@ -169,11 +169,6 @@ def box_form(convention: str) -> BoxForm:
         cure = "bring boxes of another kind into one of these, or give Detections poses T_cam_obj and dimensions_hwl"
         raise InputError("convention", f"one of {', '.join(get_args(BoxFormat))}", repr(convention), cure)
     return _FORMS[convention]
-
-
-def is_z_up(convention: BoxFormat) -> bool:
-    """Whether z is up in the frame of a format, and headings turn about it; else they turn about y, which is down."""
-    return box_form(convention).upright
 
 
 def check_upright(T_cam_boxes: Tensor, convention: BoxFormat) -> None:

@@ -63,20 +63,18 @@ def sdf_to_mesh(
     origin: Tensor,  # (3,)
     spacing_m: float,
     T_cam_obj: Tensor | None = None,  # (4, 4)
-    level_m: float = 0.0,
 ) -> trimesh.Trimesh:
-    """Closed mesh of a level of a signed distance grid, in camera coordinates, normals outward.
+    """Mesh of the surface in a signed distance grid, in camera coordinates, normals outward, closed at the border.
 
     Args:
         values: signed distance at the nodes, metres, negative inside.
         origin: node (0, 0, 0) in the object frame, metres.
         spacing_m: distance between nodes.
         T_cam_obj: pose from object to camera; None leaves the mesh in the object frame.
-        level_m: the level; 0 is the surface. Where the level leaves the grid, the mesh is closed at the border.
 
     Raises:
         InputError: wrong shapes.
-        MeshError: the field does not cross the level.
+        MeshError: the field does not cross zero.
 
     Examples:
         >>> import torch
@@ -91,12 +89,12 @@ def sdf_to_mesh(
 
     check_shape("values", values, ("nx", "ny", "nz"))
     check_shape("origin", origin, (3,))
-    above = values.detach().double().cpu().numpy() - level_m
-    if not ((above < 0).any() and (above > 0).any()):
-        raise MeshError(f"the signed distance grid does not cross the level {level_m} m: it has no surface to mesh")
+    sdf = values.detach().double().cpu().numpy()
+    if not ((sdf < 0).any() and (sdf > 0).any()):
+        raise MeshError("the signed distance grid does not cross zero: it has no surface to mesh")
     # One more node, outside, closes the mesh at the border. With "descent" the field falls towards the object, so that
     # the normals of the faces point outward.
-    padded = np.pad(above, 1, constant_values=spacing_m)
+    padded = np.pad(sdf, 1, constant_values=spacing_m)
     extract: Callable[..., tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]] = marching_cubes
     vertices, faces, _, _ = extract(padded, 0.0, spacing=(spacing_m,) * 3, gradient_direction="descent")
     vertices = vertices.astype(np.float64) - spacing_m + origin.detach().double().cpu().numpy()

@@ -179,7 +179,6 @@ TARGETS: dict[str, Target] = {
             "lower_nodes",
             "nodes_of",
             "at_corners",
-            "_along_axes",
             "Cells.outward",
             "cells_at",
             "corner_values",

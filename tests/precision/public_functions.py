@@ -370,7 +370,7 @@ WITHOUT_NUMBERS = {
     "RigEstimate.add_pixels", "RigEstimate.add_results", "RigEstimate.content", "RigEstimate.get_extra_state",
     "RigEstimate.is_guess",
     "RigEstimate.is_of", "RigEstimate.of_content", "RigEstimate.set_extra_state", "ShapeFit.arrays", "Status.code",
-    "Status.from_code", "Status.is_refined", "StereoCamera.num_frames", "box_formats.is_z_up",
+    "Status.from_code", "Status.is_refined", "StereoCamera.num_frames",
     "config_files.load_config",
     "image_boxes.box_iou", "kornia_cameras.stereo_camera_of", "pose_error.boxes_of", "pose_error.errors_of",
 }  # fmt: skip
