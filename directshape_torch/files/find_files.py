@@ -1,7 +1,4 @@
-"""This module finds the files that a user means, and remembers what was read from files that have not changed.
-
-Capitals of endings and the spelling of accents make no difference.
-"""
+"""This module finds files whatever the case of endings and the encoding of accents, and remembers their content."""
 
 from __future__ import annotations
 
@@ -13,15 +10,15 @@ from functools import lru_cache, wraps
 from pathlib import Path, PurePath
 from typing import TypeVar
 
-# File systems note the time of a change in steps: a folder that changed just now may change again unseen.
+# File systems store times of changes in steps, so a folder that changed just now may change again unnoticed.
 _SURELY_PAST_S = 2.0
-# What is left of the 255 that file systems take belongs to endings and to the names of temporary files.
+# File systems allow 255 bytes; the rest is for endings and for the names of temporary files.
 _MOST_NAME_BYTES = 200
 _T = TypeVar("_T")
 
 
 def is_frame_id(frame_id: object) -> bool:
-    """Whether a frame's name can be that of its files, and is no path.
+    """Whether a frame's name can be used in file names and is not a path.
 
     Examples:
         >>> is_frame_id("000107"), is_frame_id("/etc/passwd"), is_frame_id("..")
@@ -38,10 +35,10 @@ def is_frame_id(frame_id: object) -> bool:
 
 
 def found(path: Path) -> Path | None:
-    """A file by its name; else the one whose ending has other capitals, or whose letters are composed otherwise.
+    """A file by its name, or a file whose name differs in the case of the ending or in the encoding of accents.
 
-    macOS writes an accent and its letter apart, other systems together; cameras write `.JPG`. Of several the first in
-    order is taken. None: there is no such file.
+    macOS separates letters from accents, other systems combine them; cameras write `.JPG`. Of several matches the first
+    in order is taken. The result is None if there is no such file.
 
     Examples:
         >>> import tempfile
@@ -57,28 +54,28 @@ def found(path: Path) -> Path | None:
 
 
 def composed(name: str) -> str:
-    """The spelling of a name in which letters and their accents are one."""
+    """A name in which letters and their accents are combined."""
     return unicodedata.normalize("NFC", name)
 
 
 def is_called(path: Path, names: Iterable[str]) -> bool:
-    """Whether a file has one of some names, without its ending and however accents are written."""
+    """Whether the name of a file, without its ending, is one of `names` in any encoding of accents."""
     return composed(path.stem) in set(map(composed, names))
 
 
 def visible_files(folder: Path, endings: Iterable[str]) -> list[Path]:
-    """The files of a folder with one of some endings, such as ".txt", in whatever capitals, sorted by name.
+    """The files of a folder with one of the endings, such as ".txt", in any case, sorted by name.
 
-    Names that begin with a dot are no user's: macOS puts a `._NAME` beside each file that it copies.
+    Names that begin with a dot are left out: macOS puts a `._NAME` beside each file that it copies.
     """
     wanted = frozenset(endings)
     names = sorted(name for name in _names(folder).values() if Path(name).suffix.lower() in wanted)
-    # A broken link is somebody's file: that it leads nowhere is said when it is opened.
+    # A broken link is listed too, so that opening it reports the error.
     return [folder / name for name in names if not (folder / name).is_dir()]
 
 
 def _names(folder: Path) -> dict[str, str]:
-    """The visible names in a folder by `_key`; nothing where there is no folder."""
+    """The visible names in a folder by `_key`; the result is empty if there is no folder."""
     try:
         changed_ns = folder.stat().st_mtime_ns
     except OSError:
@@ -102,16 +99,18 @@ def _listed(folder: Path) -> dict[str, str]:
 
 
 def _key(name: str) -> str:
-    """A name as all spellings of it are: letters composed, the ending in small ones."""
+    """A name in a unique spelling: accents combined, the ending in lower case."""
     stem, ending = os.path.splitext(composed(name))
     return stem + ending.lower()
 
 
 def remembered(read: Callable[[Path], _T]) -> Callable[[Path | str], _T]:
-    """What `read` makes of a file, kept while its size and time of change stay the same: for files that serve many
-    frames. Whoever gets it leaves it as it is."""
+    """A version of `read` with a cache, which is valid while size and time of change of the file stay the same.
 
-    # With the state of the file, which is looked at only as a key.
+    It is for files that serve many frames. Callers must not modify the result.
+    """
+
+    # The state of the file is used only as a key of the cache.
     @lru_cache(maxsize=256)
     def in_state(path: Path, _size_bytes: int, _changed_ns: int) -> _T:
         return read(path)

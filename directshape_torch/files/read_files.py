@@ -1,7 +1,7 @@
-"""This module opens what a user names: regular files only, of bounded size, with errors that name the file.
+"""This module opens files that a user names: regular files of limited size, with errors that name the file.
 
-Whatever comes may be hostile: sizes and numbers are checked before a decoder allocates anything for them, and no object
-is ever unpickled.
+Files may be hostile, so sizes and numbers are checked before a decoder allocates memory for them, and nothing is
+unpickled.
 """
 
 from __future__ import annotations
@@ -15,18 +15,19 @@ from typing import Any
 from directshape_torch.errors import DataFormatError, shown
 
 MOST_BYTES = 2**29
-"""Of one file, and of what it unpacks to."""
+"""This is the limit for one file, and for its unpacked content."""
 
-# Parsed JSON takes some twenty times its size.
+# Parsed JSON takes about twenty times its size.
 _MOST_JSON_BYTES = 2**28
 _MOST_DIGITS = 18
 
 
 def read_bytes(path: Path | str, most: int = MOST_BYTES, cure: str = "check the path") -> bytes:
-    """The content of a regular file of at most that many bytes; links are followed.
+    """The content of a regular file of at most `most` bytes; links are followed.
 
     Raises:
-        DataFormatError: it is missing, cannot be read, is a folder, a pipe or a device, or too large; with the cure.
+        DataFormatError: the file is missing, unreadable, a folder, a pipe, a device, or too large; the error has the
+            cure.
 
     Examples:
         >>> read_bytes("/dev/zero")
@@ -34,7 +35,7 @@ def read_bytes(path: Path | str, most: int = MOST_BYTES, cure: str = "check the 
         ...
         directshape_torch.errors.DataFormatError: /dev/zero: is no regular file; check the path
     """
-    if not isinstance(path, (str, os.PathLike)):  # the number of an open file would do for Python
+    if not isinstance(path, (str, os.PathLike)):  # Python would accept the number of an open file
         raise DataFormatError(shown(path), "is no path", cure=cure)
     try:
         with open(path, "rb", opener=_open_at_once) as file:
@@ -49,26 +50,26 @@ def read_bytes(path: Path | str, most: int = MOST_BYTES, cure: str = "check the 
     except ValueError as error:
         if isinstance(error, DataFormatError):
             raise
-        # A NUL, or letters that no file system takes.
+        # The path has a NUL, or characters that file systems do not accept.
         raise DataFormatError(repr(str(path)), f"is no path ({error})", cure=cure) from error
 
 
 def _open_at_once(path: str, flags: int) -> int:
-    """Without waiting, as a pipe would make us until somebody writes to it."""
+    """Open a file without blocking, as a pipe would until a process writes to it."""
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def read_json(path: Path | str, cure: str = "") -> Any:
-    """The value in a JSON file; raises like `read_bytes` and `parse_json`."""
+    """The value in a JSON file; errors are those of `read_bytes` and `parse_json`."""
     return parse_json(path, read_bytes(path, _MOST_JSON_BYTES), cure)
 
 
 def parse_json(path: Path | str, text: str | bytes, cure: str = "", problem: str = "is not valid JSON") -> Any:
-    """The value of a JSON text that stands in the file `path`.
+    """The value of a JSON text from the file `path`.
 
     Raises:
-        DataFormatError: it is no JSON, nested too deeply, or holds a number that is not finite or has more than 18
-            digits before its point; with the problem and the cure.
+        DataFormatError: the text is not JSON, is nested too deeply, or has a number that is not finite or has more than
+            18 digits before its point; the error has the problem and the cure.
 
     Examples:
         >>> parse_json("a.json", "[1, 1e999]")

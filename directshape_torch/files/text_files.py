@@ -15,22 +15,22 @@ from numpy.typing import NDArray
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.read_files import read_bytes
 
-# A line of one letter takes two hundred bytes once it is numbered.
+# A numbered line of one letter takes two hundred bytes.
 _MOST_TEXT_BYTES = 2**24
-# The marks of UTF-32 are looked for first, for one of them begins with a mark of UTF-16.
+# UTF-32 is checked first, because one of its marks begins with a mark of UTF-16.
 _MARKS = {
     **dict.fromkeys((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE), "utf-32"),
     **dict.fromkeys((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE), "utf-16"),
 }
-# Lines end as on Unix, on Windows (whose other half stays, so that lines are copied as they are) or on old Macs.
+# Lines end as on Unix, on Windows (where \r stays in the line, so that lines are copied unchanged) or on old Macs.
 _LINE_END = re.compile(r"\n|\r(?!\n)")
 
 
 def read_text(path: Path | str, most: int = _MOST_TEXT_BYTES, cure: str = "check the path") -> str:
-    """The content of a text file in UTF-8, or in UTF-16 or UTF-32 where it begins with the mark of that.
+    """The content of a text file in UTF-8, or in UTF-16 or UTF-32 if it begins with their mark.
 
-    PowerShell and Excel begin texts with such a mark, which is left out. Raises like `read_bytes`, and where it is no
-    such text.
+    PowerShell and Excel write such a mark, which is removed. Errors are those of `read_bytes`, and a `DataFormatError`
+    for other content.
     """
     content = read_bytes(path, most, cure)
     encoding = next((encoding for mark, encoding in _MARKS.items() if content.startswith(mark)), "utf-8-sig")
@@ -43,19 +43,19 @@ def read_text(path: Path | str, most: int = _MOST_TEXT_BYTES, cure: str = "check
 
 @dataclass(frozen=True)
 class Line:
-    """One line: its number from 1, its text without outer white space, and all of it but the newline."""
+    """A `Line` has its number from 1, its text without outer white space, and the raw text without the newline."""
 
     number: int
     text: str
     raw: str
 
     def error(self, path: Path | str, problem: str, cure: str = "") -> DataFormatError:
-        """A complaint about the line that names it."""
+        """An error about the line that names it."""
         return DataFormatError(path, problem, line_number=self.number, line=self.text, cure=cure)
 
 
 def read_lines(path: Path | str) -> list[Line]:
-    """The lines of a text file that are not blank; raises like `read_text`."""
+    """The lines of a text file that are not blank; errors are those of `read_text`."""
     lines = (Line(number, raw.strip(), raw) for number, raw in enumerate(_LINE_END.split(read_text(path)), start=1))
     return [line for line in lines if line.text]
 
@@ -66,7 +66,7 @@ def finite_numbers(
     """The numbers (count,) of a line, or of its last words.
 
     Raises:
-        DataFormatError: it holds something else, or not as many; names file and line.
+        DataFormatError: the line has another content or number of words; the error names file and line.
 
     Examples:
         >>> finite_numbers("calib.txt", Line(3, "1 2.5", "1 2.5"), 2)

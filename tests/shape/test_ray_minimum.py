@@ -1,4 +1,4 @@
-"""The least signed distance along rays through grids and other shapes, against the reference, and its derivative."""
+"""The least signed distance along rays agrees with the reference for grids and other shapes, with derivative."""
 
 from __future__ import annotations
 
@@ -265,7 +265,7 @@ def test_the_best_depth_is_the_one_of_least_distance() -> None:
 
 
 def _grid(values: Tensor) -> GridShape:
-    """The grid has distances (nx, ny) at nodes 0.1 m apart, equal for all z."""
+    """A grid with distances (nx, ny) at nodes 0.1 m apart, equal for all z."""
     nodes = values.double()[None, ..., None].expand(1, *values.shape, 3).contiguous()
     return GridShape.of(nodes, torch.zeros(*values.shape, 3, 1).double(), torch.zeros(3).double(), 0.1)
 
