@@ -19,7 +19,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.gradient_mode import is_within_transform
 from directshape_torch.observation.packing import Observation, pack_pixels
-from directshape_torch.observation.refinable import check_fit, check_no_tangents, in_dtype_of, refusals
+from directshape_torch.observation.refinable import fitting, refusals
 from directshape_torch.refinement.fusion import UNKNOWN_DETECTOR, fused, noise_of_boxes
 from directshape_torch.refinement.outcome import as_they_came
 from directshape_torch.refinement.problem import CarProblem
@@ -130,13 +130,11 @@ class DirectShapeRefiner(nn.Module):
     def _checked_refine(
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None
     ) -> RefinementResult:
-        detections = in_dtype_of(frames, detections)
+        detections = fitting(frames, detections, self.prior, (term_weights or {}).values())
         # Given standard deviations are a prior of the energy. The detector's box must not count a second time.
         sigmas = self.detector_sigmas if detections.pose_sigma is None else None
         frames, detections = self._with_rig(frames, detections)
         noise = None if sigmas is None else noise_of_boxes(sigmas, detections.T_cam_obj)
-        of_prior = (tensor for _, tensor in (*self.prior.named_buffers(), *self.prior.named_parameters()))
-        check_no_tangents(frames, detections, (*(term_weights or {}).values(), *of_prior))
         self._warn_of(frames, detections)
         self._warn_without_gradient(frames, detections)
         differentiate = self.config.backward.mode != "none" and torch.is_grad_enabled()
@@ -207,10 +205,10 @@ class DirectShapeRefiner(nn.Module):
         detector_noise: Tensor | None,
     ) -> RefinementResult:
         seen = self._observe(frames, detections)
-        failure = refusals(frames, detections, seen, self.config)
+        cars = replace(self._cars(frames, detections), detector_noise=detector_noise)
+        failure = refusals(cars, seen, self.config)
         usable = failure < 0
-        rows = usable.nonzero()[:, 0]
-        cars = replace(self._cars(frames, detections), detector_noise=detector_noise).of_cars(usable)
+        rows, cars = usable.nonzero()[:, 0], cars.of_cars(usable)
         problem = problem_of_scene(
             self.config, self.prior, frames, detections, cars, seen.of_objects(usable), self.extra_terms, term_weights
         )
@@ -228,7 +226,7 @@ class DirectShapeRefiner(nn.Module):
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None = None
     ) -> tuple[CarProblem, CarState]:
         """The minimisation problem and the input state of the cars, for experiments; cars are not refused."""
-        frames, detections = self._with_rig(frames, in_dtype_of(frames, detections))
+        frames, detections = self._with_rig(frames, fitting(frames, detections, self.prior, ()))
         cars = self._cars(frames, detections)
         seen = self._observe(frames, detections)
         problem = problem_of_scene(
@@ -237,11 +235,10 @@ class DirectShapeRefiner(nn.Module):
         return problem, self._input_state(detections.T_cam_obj, cars)
 
     def _with_rig(self, frames: FrameBatch, detections: Detections) -> tuple[FrameBatch, Detections]:
-        """Check the inputs of a call and add what is known of the rig and the detector."""
-        frames = frames if self.rig is None else self.rig.corrected(frames)
-        check_fit(frames, detections, self.prior)
+        """The inputs of a call with what is known of the rig and the detector."""
         if self.rig is None:
             return frames, detections
+        frames = self.rig.corrected(frames)
         informed = self.rig.informed(frames, detections)
         # Standard deviations of the settings take precedence over the rig's.
         if any(self.config.priors.pose_sigmas):

@@ -71,14 +71,14 @@ class Aligned(NamedTuple):
 @full_precision()
 def aligned(refiner: DirectShapeRefiner, frames: FrameBatch, detections: Detections) -> Aligned:
     """Move boxes along the viewing rays of their origins to the lowest photometric cost."""
-    seen = pack_pixels(frames, detections, SETTINGS.sampling)
-    usable = refusals(frames, detections, seen, SETTINGS) < 0
+    cars = CarBatch.from_scene(frames, detections)
+    usable = refusals(cars, pack_pixels(frames, detections, SETTINGS.sampling), SETTINGS) < 0
     nothing = Aligned(detections.T_cam_obj, torch.zeros_like(usable))
     rows = usable.nonzero()[:, 0]
     if not len(rows):
         return nothing
     everyone, inputs = refiner.problem(frames, detections)
-    cars = CarBatch.from_scene(frames, detections).of_cars(usable)
+    cars = cars.of_cars(usable)
     problem, state = everyone.of_problems(usable), take_rows(inputs, rows)
     for range_px, step_px in _ROUNDS_PX:
         term, surface = _begun(problem, state, cars)

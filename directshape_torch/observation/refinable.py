@@ -16,6 +16,7 @@ from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.observation.packing import Observation
 from directshape_torch.scene import Detections, FrameBatch, Occluders
 from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.state.cars import CarBatch
 from directshape_torch.status import Status
 
 # A car whose origin is nearer than this is at the camera, and its silhouette is no projection.
@@ -23,7 +24,60 @@ _MIN_DEPTH_M = 1.0
 _DTYPES = (torch.float32, torch.float64)
 
 
-def check_no_tangents(frames: FrameBatch, detections: Detections, others: Iterable[Tensor]) -> None:
+def fitting(frames: FrameBatch, detections: Detections, prior: ShapePrior, others: Iterable[Tensor]) -> Detections:
+    """The detections in the dtype of the frames, after a check that frames, detections and prior fit together.
+
+    Args:
+        frames: frames of a call, as the user gives them.
+        detections: detections of the call, as the user gives them.
+        prior: shape prior of the refiner.
+        others: further tensors of the call, which must have no tangents of forward-mode differentiation.
+
+    Raises:
+        InputError: frames, detections and prior differ in dtype, device, mask size or frame numbers, or some tensor is
+            a dual number of forward-mode differentiation.
+    """
+    detections = _in_dtype_of(frames, detections)
+    if prior.origin.dtype not in _DTYPES:
+        cure = "make it anew in float32, and leave it out of what .half() or .bfloat16() is called on"
+        raise InputError("refiner", "shapes in float32 or float64", str(prior.origin.dtype), cure)
+    for name, tensor, numbers in (*frames.tensors("frames"), *detections.tensors("detections")):
+        wanted = prior.origin.dtype if numbers in FOLLOWING else tensor.dtype
+        if tensor.dtype != wanted or tensor.device != prior.origin.device:
+            raise InputError(
+                name,
+                f"dtype {wanted} on {prior.origin.device}, like the refiner",
+                f"{tensor.dtype} on {tensor.device}",
+                "move them together with .to(device, dtype)",
+            )
+    _check_masks("detections", detections, frames)
+    _check_times(detections, frames)
+    if detections.occluders is not None:
+        _check_masks("detections.occluders", detections.occluders, frames)
+    of_prior = (tensor for _, tensor in (*prior.named_buffers(), *prior.named_parameters()))
+    _check_no_tangents(frames, detections, (*others, *of_prior))
+    return detections
+
+
+def _in_dtype_of(frames: FrameBatch, detections: Detections) -> Detections:
+    """The detections in the dtype of the frames; raises `InputError` for other records, and for half precision."""
+    # Records are checked by their members and not by `isinstance`, so that a user's own record will do.
+    needed = ("frames", frames, FrameBatch, "images_left"), ("detections", detections, Detections, "mask_left")
+    for name, given, kind, member in needed:
+        if not hasattr(given, member):
+            raise InputError(name, f"a {kind.__name__}", type(given).__name__, "call it as refiner(frames, detections)")
+    if frames.images_left.dtype not in _DTYPES:
+        # This comes before the comparison of dtypes, whose message would ask for a refiner in half precision.
+        raise InputError(
+            "frames",
+            "float32 or float64",
+            str(frames.images_left.dtype),
+            "refine outside of half precision: .to(dtype=torch.float32) of frames, detections and refiner",
+        )
+    return detections.in_dtype(frames.images_left.dtype)
+
+
+def _check_no_tangents(frames: FrameBatch, detections: Detections, others: Iterable[Tensor]) -> None:
     """Raise `InputError` where some tensor of a call is a dual number of forward-mode differentiation.
 
     The iterations detach what they hold constant from gradients. Tangents would pass through it and come out wrong.
@@ -42,44 +96,6 @@ def check_no_tangents(frames: FrameBatch, detections: Detections, others: Iterab
             "some with",
             "differentiate in reverse mode: .backward(), torch.func.vjp or jacrev, with backward.mode",
         )
-
-
-def in_dtype_of(frames: FrameBatch, detections: Detections) -> Detections:
-    """The detections in the dtype of the frames; raises `InputError` for other records, and for half precision."""
-    # Records are checked by their members and not by `isinstance`, so that a user's own record will do.
-    needed = ("frames", frames, FrameBatch, "images_left"), ("detections", detections, Detections, "mask_left")
-    for name, given, kind, member in needed:
-        if not hasattr(given, member):
-            raise InputError(name, f"a {kind.__name__}", type(given).__name__, "call it as refiner(frames, detections)")
-    if frames.images_left.dtype not in _DTYPES:
-        # This comes before the comparison of dtypes, whose message would ask for a refiner in half precision.
-        raise InputError(
-            "frames",
-            "float32 or float64",
-            str(frames.images_left.dtype),
-            "refine outside of half precision: .to(dtype=torch.float32) of frames, detections and refiner",
-        )
-    return detections.in_dtype(frames.images_left.dtype)
-
-
-def check_fit(frames: FrameBatch, detections: Detections, prior: ShapePrior) -> None:
-    """Raise `InputError` unless frames, detections and prior share dtype, device, mask size and frame numbers."""
-    if prior.origin.dtype not in _DTYPES:
-        cure = "make it anew in float32, and leave it out of what .half() or .bfloat16() is called on"
-        raise InputError("refiner", "shapes in float32 or float64", str(prior.origin.dtype), cure)
-    for name, tensor, numbers in (*frames.tensors("frames"), *detections.tensors("detections")):
-        wanted = prior.origin.dtype if numbers in FOLLOWING else tensor.dtype
-        if tensor.dtype != wanted or tensor.device != prior.origin.device:
-            raise InputError(
-                name,
-                f"dtype {wanted} on {prior.origin.device}, like the refiner",
-                f"{tensor.dtype} on {tensor.device}",
-                "move them together with .to(device, dtype)",
-            )
-    _check_masks("detections", detections, frames)
-    _check_times(detections, frames)
-    if detections.occluders is not None:
-        _check_masks("detections.occluders", detections.occluders, frames)
 
 
 def _check_masks(name: str, instances: Detections | Occluders, frames: FrameBatch) -> None:
@@ -108,17 +124,17 @@ def _check_times(detections: Detections, frames: FrameBatch) -> None:
         seen.add(view)
 
 
-def refusals(frames: FrameBatch, detections: Detections, seen: Observation, config: RefinerConfig) -> Tensor:
+def refusals(cars: CarBatch, seen: Observation, config: RefinerConfig) -> Tensor:
     """The code (B,) of the status that forbids the refinement of each car, or -1."""
-    T = detections.T_cam_obj
+    T = cars.detector_T_cam_obj
     finite = T.isfinite().all(-1).all(-1)
-    upright = (T[:, :3, 1] * frames.ground.normal[detections.frame_index]).sum(-1) < 0
+    upright = (T[:, :3, 1] * cars.ground_normal_cam).sum(-1) < 0
     in_front = finite & (T[:, 2, 3] > _MIN_DEPTH_M) & upright
     if seen.points is not None and not config.fits_images:
         lacking = [(seen.points.counts < config.point_cloud.min_points, Status.too_few_points)]
     else:
         lacking = _lacking_pixels(seen, config.sampling.min_usable_pixels)
-    code = torch.full((len(detections),), -1, device=T.device)
+    code = torch.full((len(cars),), -1, device=T.device)
     # Later statuses say more, so they replace earlier ones.
     for condition, status in (*lacking, (~in_front, Status.behind_camera), (~finite, Status.non_finite)):
         code = torch.where(condition, torch.full_like(code, status.code), code)

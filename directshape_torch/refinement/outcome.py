@@ -47,7 +47,7 @@ _LEAST_MASK_IOU = 0.65
 _LEAST_MATCHED_SHARE = 0.1
 # If a car is there, its pixels have their best disparity where the refinement ended, with at most this standard
 # deviation in pixels. Most boxes and masks that are laid on other images fail this test (scripts/calibrate_trust.py,
-# column "elsewhere").
+# column "returned on other images").
 _LARGEST_OFFSET_SIGMA_PX = 0.5
 # If a car is there with a lower probability, its mask more likely shows another car or none.
 _LEAST_IS_THERE = 0.5
