@@ -48,6 +48,11 @@ _OPTIONS: dict[str, str | int | bool | Callable[..., Any]] = {
 # A function with more forms than this, for other settings, fixed sizes or dtypes, is dropped.
 _MOST_FORMS = 64
 
+# This counts modes that see every operation, such as `FlopCounterMode`; PyTorch has no public name for it. A compiled
+# form that is called under one fails, and PyTorch 2.13 never runs it again. Where PyTorch lacks this function, such a
+# call drops the form for the rest of the process, with a line in the log.
+_num_watchers: Callable[[], int] = getattr(torch._C, "_len_torch_dispatch_stack", lambda: 0)
+
 _logger = logging.getLogger(__name__)
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -128,8 +133,7 @@ def will_compile(*tensors: Tensor) -> bool:
     # This check comes first, because the user's own compilation traces the plain form.
     if torch.compiler.is_compiling() or _mode.get() == "off" or not nothing_is_differentiated():
         return False
-    # PyTorch refuses to compile under a mode that sees every operation, and has no public name to ask for it.
-    return torch._C._len_torch_dispatch_stack() == 0 and all(map(_is_fit, tensors))
+    return not _num_watchers() and all(map(_is_fit, tensors))
 
 
 def _is_fit(tensor: Tensor) -> bool:
@@ -149,7 +153,7 @@ def compiler_problem() -> str | None:
     try:
         # A thread of its own has none of the caller's modes.
         with _process.lock, warnings.catch_warnings(action="ignore"), ThreadPoolExecutor(1) as thread:
-            thread.submit(lambda: _compiled(lambda x: x + 1, traced.append)(torch.ones(2))).result()
+            thread.submit(lambda: _compiled(lambda x: x + 1, traced.append)(_with_marks(torch.ones(2), [0]))).result()
     except Exception as error:  # PyTorch's compiler can raise anything, and whatever it is there is no compiler
         return _first_line(error)
     return None if traced else "PyTorch's compiler is switched off"
@@ -167,7 +171,8 @@ def _can_compile(mode: CompileMode) -> bool:
 
 def _mark(tensor: Tensor, axis: int) -> None:
     # A mark is a wish and no demand: code that needs a fixed size may fix it. `dynamic=True` in place of marks makes
-    # every size vary, which takes three times as long to compile; PyTorch's guide to dynamic shapes names no other way.
+    # every size vary, which takes three times as long to compile. PyTorch's guide to dynamic shapes tells users to mark
+    # by this name, although it looks private. Where it is missing, `compiler_problem` says so, and nothing is compiled.
     torch._dynamo.maybe_mark_dynamic(tensor, axis)
 
 

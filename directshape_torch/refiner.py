@@ -17,7 +17,7 @@ from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import InputError, NoGradientWarning, SceneWarning
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
-from directshape_torch.numerics.gradient_mode import is_within_transform
+from directshape_torch.numerics.gradient_mode import is_plain
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import fitting, refusals
 from directshape_torch.refinement.fusion import UNKNOWN_DETECTOR, fused, noise_of_boxes
@@ -176,7 +176,8 @@ class DirectShapeRefiner(nn.Module):
         """Warn of mistakes that the tensors of this call show, as the setting `check` asks."""
         when = self.config.check
         is_due = when == "always" or (when == "first" and not self._has_checked)
-        if not is_due or not len(detections) or is_within_transform():
+        # Under a transform of `torch.func` all that is computed is wrapped, and its numbers cannot be read.
+        if not is_due or not len(detections) or not is_plain(torch.empty(1)):
             return
         # The import stands here, because only a process that asks for the check needs it, mostly once.
         from directshape_torch.scene_check.check_scene import check_scene

@@ -48,6 +48,10 @@ def _asked_in_grad(constants: Constants) -> None:
     assert slope.tolist() == [constants.first, 3.0]
 
 
+def _asked_in_functionalize(constants: Constants) -> None:
+    assert torch.func.functionalize(constants.product)(torch.ones(2)).tolist() == [constants.first, 3.0]
+
+
 def _asked_of_fakes(constants: Constants) -> None:
     with FakeTensorMode():
         assert constants.product(torch.ones(2)).shape == (2,)
@@ -70,6 +74,7 @@ ASKED = (
     _asked_plainly,
     _asked_in_jvp,
     _asked_in_grad,
+    _asked_in_functionalize,
     _asked_of_fakes,
     _asked_by_a_tracer,
     _asked_in_inference_mode,

@@ -19,15 +19,19 @@ _R = TypeVar("_R")
 
 # "none" means that nobody has asked for fewer digits.
 _FULL = ("none", "ieee")
-# PyTorch is asked about these backends by name, because `torch.backends` raises where old and new names were mixed.
-_BACKENDS = ("cuda", "mkldnn")
+# These have the newer name of the setting, `fp32_precision`, which PyTorch has had since 2.9.
+_PRODUCTS: tuple[Any, ...] = tuple(
+    products
+    for products in (torch.backends.cuda.matmul, getattr(torch.backends.mkldnn, "matmul", None))
+    if hasattr(products, "fp32_precision")
+)
 
 
 class _Setting(NamedTuple):
     """A `_Setting` says which precisions of matrix products the user has allowed."""
 
     by_old_name: str | None  # value of `torch.set_float32_matmul_precision`; None where the newer names are in use
-    asked: tuple[str, ...]  # precision asked of each backend
+    asked: tuple[str, ...]  # `fp32_precision` of each of `_PRODUCTS`
 
     @classmethod
     def now(cls) -> _Setting:
@@ -35,32 +39,28 @@ class _Setting(NamedTuple):
             by_old_name = torch.get_float32_matmul_precision()
         except RuntimeError:  # the newer names are in use, and both together are refused
             by_old_name = None
-        return cls(by_old_name, tuple(_asked(backend) for backend in _BACKENDS))
+        return cls(by_old_name, tuple(products.fp32_precision for products in _PRODUCTS))
 
     def suspend(self) -> None:
         """Ask for all digits, by the names that the user uses."""
         if self.by_old_name not in (None, "highest"):
             torch.set_float32_matmul_precision("highest")
             return
-        for backend, value in zip(_BACKENDS, self.asked, strict=True):
+        for products, value in zip(_PRODUCTS, self.asked, strict=True):
             if value not in _FULL:
-                torch._C._set_fp32_precision_setter(backend, "matmul", "ieee")
+                products.fp32_precision = "ieee"
 
     def restore(self) -> None:
         """Allow again what was allowed before `suspend`."""
         if self.by_old_name not in (None, "highest"):
             torch.set_float32_matmul_precision(self.by_old_name)
             return
-        for backend, value in zip(_BACKENDS, self.asked, strict=True):
+        for products, value in zip(_PRODUCTS, self.asked, strict=True):
             if value not in _FULL:
                 # "none" comes first, so that a value from `torch.backends.fp32_precision` goes on following it.
-                torch._C._set_fp32_precision_setter(backend, "matmul", "none")
-                if _asked(backend) != value:
-                    torch._C._set_fp32_precision_setter(backend, "matmul", value)
-
-
-def _asked(backend: str) -> str:
-    return torch._C._get_fp32_precision_getter(backend, "matmul")
+                products.fp32_precision = "none"
+                if products.fp32_precision != value:
+                    products.fp32_precision = value
 
 
 @dataclass

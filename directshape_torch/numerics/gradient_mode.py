@@ -8,6 +8,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -20,12 +21,10 @@ def nothing_is_differentiated() -> bool:
 
 def is_forward_mode() -> bool:
     """Whether the caller is inside a region of forward-mode differentiation."""
-    return torch.autograd.forward_ad._current_level >= 0
-
-
-def is_within_transform() -> bool:
-    """Whether a transform of `torch.func` is at work, under which no numbers of a tensor can be read."""
-    return torch._C._functorch.maybe_current_level() is not None
+    # PyTorch gives the tensor itself outside of such a region, and inside a view of it. The tensor is new, because
+    # tracers refuse tensors that others have made, and `torch.vmap` has no such view of those that it wraps.
+    probe = torch.empty(0)
+    return unpack_dual(probe).primal is not probe  # type: ignore[no-untyped-call]
 
 
 def as_constant(function: Callable[_P, _R]) -> Callable[_P, _R]:
@@ -60,4 +59,7 @@ def is_plain(tensor: Tensor) -> bool:
     """
     if torch.compiler.is_compiling() or type(tensor) not in (Tensor, torch.nn.Parameter):
         return False
-    return not torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+    try:
+        return tensor.data_ptr() != 0 or tensor.numel() == 0
+    except RuntimeError:  # The wrappers of `torch.func` have no memory.
+        return False

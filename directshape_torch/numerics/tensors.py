@@ -74,7 +74,7 @@ def _kept(
         return known
     with torch.inference_mode(False):
         made = make(like.dtype, like.device)
-        if is_plain(torch.empty(0, device=like.device)):
+        if is_plain(torch.empty(1, device=like.device)):
             if len(constants) >= _MOST_KEPT:
                 constants.clear()
             constants[key] = made

@@ -11,7 +11,6 @@ from torch.autograd.forward_ad import unpack_dual
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import FOLLOWING
-from directshape_torch.numerics.gradient_mode import is_forward_mode
 from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.observation.packing import Observation
 from directshape_torch.scene import Detections, FrameBatch, Occluders
@@ -84,8 +83,6 @@ def _check_no_tangents(frames: FrameBatch, detections: Detections, others: Itera
     """
     # Forward mode is on for the whole process, also by regions of other threads. What counts is whether these tensors
     # take part.
-    if not is_forward_mode():
-        return
     declared = [each.value for record in (frames, detections) for each in record.tensors("")]
     field = frames.camera.disparity_field
     of_field = [] if field is None else [x for x in vars(field).values() if isinstance(x, Tensor)]

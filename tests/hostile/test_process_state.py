@@ -32,7 +32,7 @@ from directshape_torch.shape.load_prior import load_prior
 
 
 def state() -> dict[str, Any]:
-    tf32 = [torch._C._get_fp32_precision_getter(backend, "matmul") for backend in ("cuda", "mkldnn")]
+    tf32 = [products.fp32_precision for products in (torch.backends.cuda.matmul, torch.backends.mkldnn.matmul)]
     return {
         "umask": next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("Umask")),
         "threads": (torch.get_num_threads(), torch.get_num_interop_threads(), cv2.getNumThreads()),

@@ -1,0 +1,37 @@
+"""The package and its programs ask PyTorch by public names, so that other versions of PyTorch serve them, too."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+# PyTorch's documentation tells users to take these by these names.
+DOCUMENTED = {"torch._dynamo.maybe_mark_dynamic", "torch.utils._python_dispatch.TorchDispatchMode"}
+# `compile.py` says what this is for, and does without it where it is missing.
+OPTIONAL = {"torch._C"}
+
+
+def names_of_torch(tree: ast.AST) -> Iterator[str]:
+    """Every dotted name that begins with torch, also within longer ones, and what is imported from PyTorch."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and ast.unparse(node).startswith("torch."):
+            yield ast.unparse(node)
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "torch":
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name.split(".")[0] == "torch")
+
+
+def is_private(name: str) -> bool:
+    return any(part.startswith("_") and not part.startswith("__") for part in name.split("."))
+
+
+def test_private_names_of_pytorch_do_not_occur() -> None:
+    files = [*(ROOT / "directshape_torch").rglob("*.py"), *(ROOT / "scripts").rglob("*.py")]
+    found = {name for file in files for name in names_of_torch(ast.parse(file.read_text(encoding="utf-8")))}
+    allowed = DOCUMENTED | OPTIONAL
+    private = {name for name in found if is_private(name) and not any(each.startswith(name) for each in allowed)}
+    assert private == set()
+    assert allowed <= found
