@@ -1,4 +1,4 @@
-"""This module marks hot tensor functions by `@compilable(sizes={...})` and compiles them by `torch.compile`.
+"""This module marks hot tensor functions by `@compilable` and compiles them by `torch.compile`.
 
 A marked function is called like any other. It is compiled inside a `compiling` region alone, which the refiner opens
 around its work by the setting `compile: auto | on | off`. PyTorch's own cache on disk keeps compiled code.
@@ -12,18 +12,20 @@ import logging
 import os
 import threading
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field, is_dataclass
-from typing import Any, Generic, Literal, ParamSpec, TypeVar
+from typing import Any, Generic, Literal, ParamSpec, TypeVar, get_type_hints
 
 import torch
 from torch import Tensor
 
 from directshape_torch.errors import CompilationError
 from directshape_torch.numerics.gradient_mode import is_plain, nothing_is_differentiated
+from directshape_torch.numerics.records import Dense, dense_of
+from directshape_torch.numerics.tables import declared, is_table, varying_axes
 
 CompileMode = Literal["auto", "on", "off"]
 
@@ -176,31 +178,35 @@ def _mark(tensor: Tensor, axis: int) -> None:
     torch._dynamo.maybe_mark_dynamic(tensor, axis)
 
 
-def with_varying(value: _T, axes_of: Callable[[Tensor], Iterable[int]]) -> _T:
-    """A copy of a tensor, named tuple or dataclass, with marks on the axes whose sizes vary from call to call."""
+def with_varying(table: _T) -> _T:
+    """A copy of a table with marks on the axes whose sizes vary from call to call, if its code will be compiled."""
+    if not will_compile():
+        return table
 
-    def of_record(record: Any) -> Any:
-        if not is_dataclass(record):
-            return record
-        copy = object.__new__(type(record))
-        vars(copy).update({name: walked(part, name) for name, part in vars(record).items()})
+    def of_other(value: Any) -> Any:
+        if isinstance(value, tuple) or not is_table(value):
+            return value
+        copy = object.__new__(type(value))
+        vars(copy).update({name: walked(getattr(value, name), spec) for name, spec in declared(value).items()})
         return copy
 
-    walked = _walker(lambda tensor, _: _with_marks(tensor, axes_of(tensor)), of_record)
-    return walked(value, "")  # type: ignore[no-any-return]
+    walked = _walker(lambda tensor, spec: _with_marks(tensor, varying_axes(spec)), of_other)
+    return walked(table, None)  # type: ignore[no-any-return]
 
 
-def _walker(of_tensor: Callable[[Tensor, str], Any], of_other: Callable[[Any], Any]) -> Callable[[Any, str], Any]:
-    """A function that copies nested tuples, with `of_tensor` for each tensor and its name, `of_other` for the rest."""
+def _walker(
+    of_tensor: Callable[[Tensor, Dense | None], Any], of_other: Callable[[Any], Any]
+) -> Callable[[Any, Dense | None], Any]:
+    """A function that copies nested tuples: `of_tensor` makes each tensor by its declaration, `of_other` the rest."""
 
-    def walked(value: Any, name: str) -> Any:
+    def walked(value: Any, spec: Dense | None) -> Any:
         if isinstance(value, Tensor):
-            return of_tensor(value, name)
+            return of_tensor(value, spec)
         if not isinstance(value, tuple):
             return of_other(value)
         if hasattr(value, "_fields"):
-            return type(value)(*map(walked, value, value._fields))
-        return tuple([walked(part, name) for part in value])
+            return type(value)(*map(walked, value, declared(value).values()))
+        return tuple([walked(part, None) for part in value])
 
     return walked
 
@@ -213,40 +219,45 @@ def _with_marks(tensor: Tensor, axes: Iterable[int]) -> Tensor:
     return tensor
 
 
-def compilable(sizes: Mapping[str, int]) -> Callable[[Callable[_P, _R]], Compilable[_P, _R]]:
-    """Mark a pure function of tensors, named tuples of them, numbers and strings for compilation.
+def compilable(function: Callable[_P, _R]) -> Compilable[_P, _R]:
+    """Mark a pure function of tensors, tables of them, numbers and strings for compilation.
 
-    Inside a `compiling` region it is compiled once for all values of the named sizes, and once more for each
-    combination of other sizes, dtypes, devices, numbers and strings. Calls that cannot be compiled (`will_compile`),
-    and calls with a named size below 2, which is a special case in PyTorch, take the plain form. A compiled form that
-    fails where the plain one works is dropped for the rest of the process; the log says so in one line.
-
-    Args:
-        sizes: dimensions whose sizes vary from call to call, by the names of arguments, or of fields of named tuples.
+    Inside a `compiling` region it is compiled once for all sizes of the axes that vary (see `tables`), as arguments and
+    fields declare them, and once more for each combination of other sizes, dtypes, devices, numbers and strings. Calls
+    that cannot be compiled (`will_compile`), and calls with a varying size below 2, which is a special case in PyTorch,
+    take the plain form. A compiled form that fails where the plain one works is dropped for the rest of the process;
+    the log says so in one line.
 
     Raises:
         CompilationError: by the marked function, in mode "on", where its first compilation fails.
 
     Examples:
-        >>> @compilable(sizes={"points": 0})
-        ... def distances(points: torch.Tensor) -> torch.Tensor:
+        >>> from typing import Annotated
+        >>> @compilable
+        ... def distances(points: Annotated[torch.Tensor, Dense("A", 2)]) -> torch.Tensor:
         ...     return points.norm(dim=-1)
         >>> distances(torch.tensor([[3.0, 4.0]]))
         tensor([5.])
     """
-    return functools.partial(Compilable, sizes)
+    return Compilable(function)
 
 
 class Compilable(Generic[_P, _R]):
     """A `Compilable` is a pure function in two forms, plain and compiled; see `compilable`."""
 
-    def __init__(self, sizes: Mapping[str, int], function: Callable[_P, _R]) -> None:
+    def __init__(self, function: Callable[_P, _R]) -> None:
         self.plain = function
-        self._sizes, self._signature = sizes, inspect.signature(function)
+        self._signature = inspect.signature(function)
         self._compiled: Callable[..., _R] | None = None
         self._has_worked = False
         self._problem: str | None = None
         functools.update_wrapper(self, function)
+
+    @functools.cached_property
+    def _specs(self) -> list[Dense | None]:
+        """The declarations of the arguments."""
+        hints = get_type_hints(self.plain, include_extras=True)
+        return [dense_of(hints.get(name)) for name in self._signature.parameters]
 
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
         if not will_compile():
@@ -256,8 +267,7 @@ class Compilable(Generic[_P, _R]):
             return self.plain(*args, **kwargs)
         values = self._signature.bind(*args, **kwargs).args if kwargs else args
         try:
-            named = zip(self._signature.parameters, values, strict=False)
-            prepared = [_prepared(value, name, self._sizes) for name, value in named]
+            prepared = [_prepared(value, spec) for value, spec in zip(values, self._specs, strict=False)]
         except _StaysPlainError:
             return self.plain(*args, **kwargs)
         try:
@@ -297,14 +307,14 @@ class _StaysPlainError(Exception):
     """These arguments have no compiled form."""
 
 
-def _prepared(value: Any, name: str, sizes: Mapping[str, int]) -> Any:
-    """An argument as compiled code takes it: contiguous, without gradient, with its varying size marked."""
+def _prepared(value: Any, spec: Dense | None) -> Any:
+    """An argument as compiled code takes it: contiguous, without gradient, with its varying sizes marked."""
 
-    def of_tensor(tensor: Tensor, called: str) -> Tensor:
-        varies = called in sizes
-        if not _is_fit(tensor) or (varies and tensor.shape[sizes[called]] < 2):
+    def of_tensor(tensor: Tensor, spec: Dense | None) -> Tensor:
+        axes = varying_axes(spec)
+        if not _is_fit(tensor) or any(tensor.shape[axis] < 2 for axis in axes):
             raise _StaysPlainError
-        return _with_marks(tensor, [sizes[called]] if varies else [])
+        return _with_marks(tensor, axes)
 
     def of_other(other: Any) -> Any:
         if other is None or isinstance(other, (int, float, str)) or is_dataclass(other):
@@ -312,7 +322,7 @@ def _prepared(value: Any, name: str, sizes: Mapping[str, int]) -> Any:
         # A value that the compiler cannot look into counts as a new one at each call.
         raise _StaysPlainError
 
-    return _walker(of_tensor, of_other)(value, name)
+    return _walker(of_tensor, of_other)(value, spec)
 
 
 def _compiled(function: Callable[_P, _R], on_compilation: Callable[[int], None]) -> Callable[_P, _R]:

@@ -18,6 +18,7 @@ from directshape_torch.errors import InputError, NoGradientWarning, SceneWarning
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.gradient_mode import is_plain
+from directshape_torch.numerics.tables import Chosen
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import fitting, refusals
 from directshape_torch.refinement.fusion import UNKNOWN_DETECTOR, fused, noise_of_boxes
@@ -208,10 +209,10 @@ class DirectShapeRefiner(nn.Module):
         seen = self._observe(frames, detections)
         cars = replace(self._cars(frames, detections), detector_noise=detector_noise)
         failure = refusals(cars, seen, self.config)
-        usable = failure < 0
-        rows, cars = usable.nonzero()[:, 0], cars.of_cars(usable)
+        usable = Chosen.where(failure < 0)
+        rows, cars = usable.index, cars.of(usable)
         problem = problem_of_scene(
-            self.config, self.prior, frames, detections, cars, seen.of_objects(usable), self.extra_terms, term_weights
+            self.config, self.prior, frames, detections, cars, seen.of(usable), self.extra_terms, term_weights
         )
         came = as_they_came(self.prior, frames, detections, failure, problem.term_names)
         if not len(rows):

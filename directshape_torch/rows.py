@@ -8,12 +8,14 @@ blocks along without a row being moved. The blocks are the last axis but one of 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
 
+from directshape_torch.numerics.records import Dense
+from directshape_torch.numerics.tables import Chosen, Table
 from directshape_torch.numerics.tensors import occurrences
 
 BLOCK = 64
@@ -23,45 +25,30 @@ _LEAST_DIRECTION = 1e-12
 
 
 @dataclass(frozen=True)
-class PixelSamples:
+class PixelSamples(Table):
     """`PixelSamples` are P pixels of one image side, sorted by object."""
 
-    object_index: Tensor  # (P,) ascending
-    uv: Tensor  # (P, 2) pixels
-    origin_cam: Tensor  # (P, 3) camera centre of the pixel's own camera, in the left camera frame, metres
-    ray_cam: Tensor  # (P, 3) direction of unit depth in the pixel's own camera, in the left camera frame
-    foreground: Tensor  # (P,) probability in [0, 1] of the mask at the pixel
-    gradient_magnitude: Tensor  # (P,) grey levels per pixel
-    bias_px: Tensor  # (P,) residual disparity at the (corresponding) left pixel, zero without a field
-    vertical_px: Tensor  # (P,) residual row offset at the (corresponding) left pixel, zero without a field
+    object_index: Annotated[Tensor, Dense("P", numbers_of="B")]  # ascending
+    uv: Annotated[Tensor, Dense("P", 2)]  # pixels
+    origin_cam: Annotated[Tensor, Dense("P", 3)]  # centre of the pixel's own camera, in the left camera frame, metres
+    ray_cam: Annotated[Tensor, Dense("P", 3)]  # of unit depth in the pixel's own camera, in the left camera frame
+    foreground: Annotated[Tensor, Dense("P")]  # probability in [0, 1] of the mask at the pixel
+    gradient_magnitude: Annotated[Tensor, Dense("P")]  # grey levels per pixel
+    bias_px: Annotated[Tensor, Dense("P")]  # residual disparity at the left pixel, zero without a field
+    vertical_px: Annotated[Tensor, Dense("P")]  # residual row offset at the left pixel, zero without a field
 
     def __len__(self) -> int:
         return len(self.object_index)
 
-    def select(self, index: Tensor) -> PixelSamples:
-        """The pixels with the numbers (Q,), in the order of the numbers."""
-        return replace(self, **{f.name: getattr(self, f.name).index_select(0, index) for f in fields(self)})
-
-    def of_objects(self, keep: Tensor) -> PixelSamples:
-        """The pixels of the objects where `keep` (B,) holds, renumbered."""
-        new_number = torch.cumsum(keep.long(), 0) - 1
-        chosen = self.select(keep[self.object_index].nonzero()[:, 0])
-        return replace(chosen, object_index=new_number[chosen.object_index])
-
 
 @dataclass(frozen=True)
-class PointSamples:
+class PointSamples(Table):
     """`PointSamples` are P points of B cars, sorted by object."""
 
-    object_index: Tensor  # (P,) ascending
-    points_cam: Tensor  # (P, 3) metres
-    counts: Tensor  # (B,) points that passed the filters, before the reduction to `max_points`
-
-    def of_objects(self, keep: Tensor) -> PointSamples:
-        """The points of the objects where `keep` (B,) holds, renumbered."""
-        new_number = torch.cumsum(keep.long(), 0) - 1
-        rows = keep[self.object_index].nonzero()[:, 0]
-        return PointSamples(new_number[self.object_index[rows]], self.points_cam[rows], self.counts[keep])
+    object_index: Annotated[Tensor, Dense("P", numbers_of="B")]  # ascending
+    points_cam: Annotated[Tensor, Dense("P", 3)]  # metres
+    # points that passed the filters, before the reduction to `max_points`
+    counts: Annotated[Tensor, Dense("B", kind="index")]
 
 
 @dataclass(frozen=True)
@@ -100,8 +87,8 @@ class Blocks(NamedTuple):
     The host knows how many blocks each car has, so that it need not wait for the device when cars are left out.
     """
 
-    owner: Tensor  # (M,) car of each block
-    counts: tuple[int, ...]  # (B,) number of blocks of each car
+    owner: Annotated[Tensor, Dense("M", numbers_of="B")]  # car of each block
+    counts: Annotated[tuple[int, ...], Dense("B")]  # number of blocks of each car
 
     @classmethod
     def one_each(cls, num_cars: int, device: torch.device) -> Blocks:
@@ -114,26 +101,19 @@ class Blocks(NamedTuple):
         counts = tuple(map(sum, zip(*(part.counts for part in parts), strict=True)))
         return cls(torch.cat([part.owner for part in parts]), counts)
 
-    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> tuple[Blocks, Tensor]:
-        """The blocks of the cars where `keep` (B,) holds, renumbered, and their numbers (R,) among all blocks.
-
-        Args:
-            keep: (B,) bool.
-            numbers: where `keep` holds, as the host knows it.
-        """
-        counts = tuple(self.counts[number] for number in numbers)
-        kept = torch.nonzero_static(keep[self.owner], size=sum(counts))[:, 0]
-        new_number = torch.cumsum(keep.long(), 0) - 1
-        return Blocks(new_number[self.owner[kept]], counts), kept
+    def kept(self, cars: Chosen) -> Tensor:
+        """The numbers (R,) of the blocks of some cars."""
+        return torch.nonzero_static(cars.keep[self.owner], size=sum(self.counts[n] for n in cars.numbers))[:, 0]
 
 
 class Rows(NamedTuple):
     """`Rows` say how packed rows, sorted by car, fill blocks."""
 
     blocks: Blocks
-    row: Tensor  # (M, 64) row in each place; an empty place repeats a row of its own car
-    filled: Tensor  # (M, 64) bool, which places are filled
-    num_rows: int
+    # row in each place; an empty place repeats a row of its own car
+    row: Annotated[Tensor, Dense("M", BLOCK, numbers_of="P")]
+    filled: Annotated[Tensor, Dense("M", BLOCK, kind="flags")]  # which places are filled
+    rows_of_car: Annotated[tuple[int, ...], Dense("B")]  # number of rows of each car, as the host knows it
 
     @classmethod
     def of_sorted(cls, car: Tensor, num_cars: int) -> Rows:
@@ -147,7 +127,7 @@ class Rows(NamedTuple):
         """
         rows_of_car = occurrences(car, num_cars)
         blocks_of_car = (rows_of_car + BLOCK - 1) // BLOCK
-        counts = tuple(blocks_of_car.tolist())
+        num_rows, counts = (tuple(numbers) for numbers in torch.stack([rows_of_car, blocks_of_car]).tolist())
         cars = torch.arange(num_cars, device=car.device)
         owner = torch.repeat_interleave(cars, blocks_of_car, output_size=sum(counts))
         first_row, first_block = (torch.cumsum(n, 0) - n for n in (rows_of_car, blocks_of_car))
@@ -156,12 +136,12 @@ class Rows(NamedTuple):
         filled = place < rows_of_car[owner][:, None]
         # An empty place must not bring another car's numbers, which may be NaN, nor an index out of range.
         row = first_row[owner][:, None] + torch.where(filled, place, place[:, :1])
-        return cls(Blocks(owner, counts), row, filled, len(car))
+        return cls(Blocks(owner, counts), row, filled, num_rows)
 
     @property
     def places(self) -> Tensor:
         """Place (P,) of each row among the M * 64 of all blocks."""
-        return torch.nonzero_static(self.filled.flatten(), size=self.num_rows)[:, 0]
+        return torch.nonzero_static(self.filled.flatten(), size=sum(self.rows_of_car))[:, 0]
 
 
 class CarSums(NamedTuple):
@@ -198,18 +178,14 @@ class CarSums(NamedTuple):
 class Rays(NamedTuple):
     """`Rays` are the rays of blocks in the left camera's frame; each block has one camera and one car."""
 
-    owner: Tensor  # (M,) car
-    centre_cam: Tensor  # (M, 3) centre of the pixels' own camera, metres
-    ray_cam: Tensor  # (3, M, R) directions of unit depth in the pixels' own camera
+    owner: Annotated[Tensor, Dense("M", numbers_of="B")]  # car
+    centre_cam: Annotated[Tensor, Dense("M", 3)]  # centre of the pixels' own camera, metres
+    ray_cam: Annotated[Tensor, Dense(3, "M", "R")]  # directions of unit depth in the pixels' own camera
 
     @classmethod
     def of_rows(cls, rows: Rows, centre_cam: Tensor, ray_cam: Tensor) -> Rays:
         """The rays of blocks, from camera centres and rays (P, 3) of packed rows."""
         return cls(rows.blocks.owner, centre_cam[rows.row[:, 0]], ray_cam[rows.row].movedim(-1, 0).contiguous())
-
-    def take(self, blocks: Tensor, owner: Tensor) -> Rays:
-        """The rays of the blocks (Q,), whose cars (Q,) may be numbered anew."""
-        return Rays(owner, self.centre_cam[blocks], self.ray_cam.index_select(1, blocks))
 
     def in_objects(self, T_obj_cam: Tensor) -> ObjectRays:
         """The rays in the frames of their cars, by the poses (B, 4, 4) of the cars."""

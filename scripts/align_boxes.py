@@ -31,6 +31,7 @@ from directshape_torch.io.result_files import write_result_text
 from directshape_torch.io.run_folder import result_path
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.numerics.full_precision import full_precision
+from directshape_torch.numerics.tables import Chosen, take_rows
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.observation.packing import pack_pixels
 from directshape_torch.observation.refinable import refusals
@@ -38,7 +39,6 @@ from directshape_torch.refinement.disparity_profile import profile_figures, prof
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.result import KittiBoxes
 from directshape_torch.rows import CarSums, ObjectRays, Rays
-from directshape_torch.solver.problem import take_rows
 from directshape_torch.state.cars import CarBatch, CarState
 from directshape_torch.terms.depth import Hits
 from directshape_torch.terms.photometric import Photometric, Surface
@@ -72,14 +72,13 @@ class Aligned(NamedTuple):
 def aligned(refiner: DirectShapeRefiner, frames: FrameBatch, detections: Detections) -> Aligned:
     """Move boxes along the viewing rays of their origins to the lowest photometric cost."""
     cars = CarBatch.from_scene(frames, detections)
-    usable = refusals(cars, pack_pixels(frames, detections, SETTINGS.sampling), SETTINGS) < 0
-    nothing = Aligned(detections.T_cam_obj, torch.zeros_like(usable))
-    rows = usable.nonzero()[:, 0]
+    usable = Chosen.where(refusals(cars, pack_pixels(frames, detections, SETTINGS.sampling), SETTINGS) < 0)
+    nothing, rows = Aligned(detections.T_cam_obj, torch.zeros_like(usable.keep)), usable.index
     if not len(rows):
         return nothing
     everyone, inputs = refiner.problem(frames, detections)
-    cars = cars.of_cars(usable)
-    problem, state = everyone.of_problems(usable), take_rows(inputs, rows)
+    cars = cars.of(usable)
+    problem, state = everyone.of(usable), take_rows(inputs, rows)
     for range_px, step_px in _ROUNDS_PX:
         term, surface = _begun(problem, state, cars)
         offsets = profile_offsets(range_px, step_px).to(state.code.device)
@@ -138,7 +137,7 @@ def moved_costs(
 
 def _begun(problem: CarProblem, state: CarState, cars: CarBatch) -> tuple[Photometric, Surface]:
     """The photometric term with the pixels of the near sides, and the surface of these sides."""
-    hits = box_hits(problem.rays[0], state.T_obj_cam, cars.detector_hwl)
+    hits = box_hits(problem.masks.of_sides[0], state.T_obj_cam, cars.detector_hwl)
     sight = problem.look(state)._replace(hits=hits)
     term = problem.begin(-1, sight).photometric
     assert term is not None, "the settings give this term a weight"

@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Annotated
 
 import pytest
 import torch
@@ -27,6 +28,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from directshape_torch import compile as compile_module
 from directshape_torch.compile import CARS_WORTH_COMPILING, Compilable, cars_ahead, compiling, num_forms, will_compile
 from directshape_torch.errors import CompilationError
+from directshape_torch.numerics.records import Dense
 
 pytestmark = pytest.mark.usefixtures("fresh_compiler_counts")
 
@@ -236,6 +238,7 @@ NOWHERE = """
 import logging, torch
 from directshape_torch.compile import cars_ahead, compiling
 from directshape_torch.errors import CompilationError
+from directshape_torch.numerics.records import Dense
 logging.basicConfig()
 for mode in ("auto", "auto", "on"):
     try:
@@ -263,16 +266,24 @@ def test_what_keeps_the_compiler_from_working_is_said(name: str, reason: str, tm
     assert refused.endswith("set compile to auto or off")
 
 
+def twice(x: Annotated[Tensor, Dense("A")]) -> Tensor:
+    return 2 * x
+
+
+def product(x: Annotated[Tensor, Dense("A", 2)], y: Tensor) -> Tensor:
+    return x @ y
+
+
 class TestFailure:
     @staticmethod
-    def branching(x: Tensor) -> Tensor:
+    def branching(x: Annotated[Tensor, Dense("A")]) -> Tensor:
         """A function that cannot be one graph."""
         return x + 1 if bool(x.sum() > 0) else x - 1
 
     @pytest.fixture
     def broken(self, monkeypatch: pytest.MonkeyPatch) -> Compilable[[Tensor], Tensor]:
         trace_only(monkeypatch)
-        return new_compilable(self.branching, {"x": 0})
+        return new_compilable(self.branching)
 
     @torch.no_grad()
     def test_auto_says_so_once_and_goes_on(self, broken: Compilable[[Tensor], Tensor], caplog) -> None:
@@ -309,7 +320,7 @@ class TestFailure:
             return run
 
         trace_only(monkeypatch, fails_when_five)
-        function = new_compilable(lambda x: 2 * x, {"x": 0})
+        function = new_compilable(twice)
         with caplog.at_level(logging.INFO), cars_ahead(CARS_WORTH_COMPILING), compiling(mode):
             for size in (3, 5, 3, 5):
                 assert function(torch.ones(size)).tolist() == [2.0] * size
@@ -321,7 +332,7 @@ class TestFailure:
     @torch.no_grad()
     def test_what_is_wrong_with_the_arguments_drops_nothing(self, monkeypatch: pytest.MonkeyPatch) -> None:
         trace_only(monkeypatch)
-        function = new_compilable(lambda x, y: x @ y, {"x": 0})
+        function = new_compilable(product)
         with compiling("on"):
             with pytest.raises(RuntimeError, match="shapes cannot be multiplied"):
                 function(torch.ones(3, 2), torch.ones(3, 2))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import pytest
 import torch
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig, RefinerConfig
 from directshape_torch.errors import InputError
+from directshape_torch.numerics.records import Dense
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
@@ -29,7 +30,7 @@ from directshape_torch.terms.car_points import car_points
 from directshape_torch.terms.point_cloud import PointCloud
 from directshape_torch.terms.priors import PriorResidual, PriorTerm, height_prior
 from directshape_torch.terms.robust import RobustValue, quadratic
-from directshape_torch.terms.term import Linear, Sight, Term, Where
+from directshape_torch.terms.term import Linear, Nowhere, Sight, Term
 
 
 def lower_by(metres: Tensor | float) -> Callable[[CarBatch, CarState], PriorResidual]:
@@ -200,8 +201,8 @@ BROKEN: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "one cost for all names": ({"moving": _one_cost_for_all}, r"the cost of moving\(...\): expected shape \(2, 1\)"),
     "cars that do not leave": (
-        {"of_cars": lambda self, *_: self},
-        r"'user' after of_cars\(...\): blocks.owner: expected numbers of the 1 cars, got 0..1",
+        {"of": lambda self, _: self},
+        r"'user' after of\(cars\): expected values for 1 cars, got .*; hand tensors",
     ),
 }
 
@@ -223,7 +224,7 @@ def test_a_member_that_is_missing_is_named() -> None:
         refine(lambda *_: Bare())  # type: ignore[arg-type, return-value]
 
 
-REQUIRED = ("names", "blocks", "block_weight", "information", "row_weight", "residual", "norm", "of_cars")
+REQUIRED = ("names", "blocks", "block_weight", "information", "row_weight", "residual", "norm")
 
 
 @pytest.mark.parametrize("name", REQUIRED)
@@ -241,9 +242,9 @@ class LowerTerm(Term):
     names: tuple[str, ...]
     cars: CarBatch
     blocks: Blocks
-    block_weight: Tensor
-    column: Tensor
-    row_weight: Tensor
+    block_weight: Annotated[Tensor, Dense("B")]
+    column: Annotated[Tensor, Dense("B", kind="index")]
+    row_weight: Annotated[Tensor, Dense("B", 1, 1)]
     sees = (POSE,)
 
     @property
@@ -251,29 +252,26 @@ class LowerTerm(Term):
         return self.block_weight
 
     @classmethod
-    def of(cls, name: str, cars: CarBatch) -> Self:
+    def on(cls, name: str, cars: CarBatch) -> Self:
         weight = torch.full((len(cars),), 1e5, dtype=torch.float64)
         blocks = Blocks.one_each(len(cars), weight.device)
         return cls((name,), cars, blocks, weight, torch.zeros_like(blocks.owner), torch.ones(len(cars), 1, 1).double())
 
-    def linear(self, field: Field, state: CarState, where: Where) -> Linear:
+    def linear(self, field: Field, state: CarState, where: Nowhere) -> Linear:
         at, one = lower_by(0.1)(self.cars, state), torch.ones_like(self.row_weight)
         return Linear(at.residual[..., None], one, at.J_residual_state, where)
 
-    def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
+    def residual(self, field: Field, state: CarState, where: Nowhere) -> Tensor:
         return lower_by(0.1)(self.cars, state).residual[..., None]
 
     def norm(self, residual: Tensor) -> RobustValue:
         return quadratic(residual)
 
-    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Self:
-        return self.of(self.names[0], self.cars.of_cars(keep, numbers))
-
 
 def test_members_may_be_fields_of_a_dataclass() -> None:
     with pytest.raises(TypeError, match="6 required positional arguments"):
         LowerTerm()  # type: ignore[call-arg]
-    by_fields = refine(lambda *scene: LowerTerm.of("user", scene[2]))
+    by_fields = refine(lambda *scene: LowerTerm.on("user", scene[2]))
     by_properties = refine(lambda *scene: PriorTerm("user", 1e5, scene[2], lower_by(0.1), 1, (POSE,), is_prior=False))
     torch.testing.assert_close(by_fields.T_cam_obj, by_properties.T_cam_obj, rtol=0, atol=0)
     torch.testing.assert_close(by_fields.covariance, by_properties.covariance, rtol=0, atol=0)
@@ -287,8 +285,8 @@ def test_a_residual_without_a_jacobian_is_differentiated() -> None:
         return lower_by(0.1)(cars, state).residual
 
     alone = refine(made(residual_of=height))
-    of_term = refine(lambda *scene: ResidualTerm.of("user", scene[2]))
-    measured = refine(lambda *scene: LowerTerm.of("user", scene[2]))
+    of_term = refine(lambda *scene: ResidualTerm.on("user", scene[2]))
+    measured = refine(lambda *scene: LowerTerm.on("user", scene[2]))
     for found, expected in ((alone, by_hand), (of_term, measured)):
         torch.testing.assert_close(found.T_cam_obj, expected.T_cam_obj, rtol=0, atol=1e-9)
         torch.testing.assert_close(found.covariance, expected.covariance, rtol=1e-6, atol=1e-12)
@@ -303,13 +301,13 @@ class ResidualTerm(LowerTerm):
 class TwoToARow(ResidualTerm):
     """A `TwoToARow` has two residuals in each row, which have one inner scalar only if the term says which."""
 
-    def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
+    def residual(self, field: Field, state: CarState, where: Nowhere) -> Tensor:
         return super().residual(field, state, where).expand(-1, -1, 2)
 
 
 def test_two_residuals_of_a_row_need_a_jacobian_by_hand() -> None:
     with pytest.raises(InputError, match=r"'user': residual\(...\): expected one residual a row.*write linear"):
-        refine(lambda *scene: TwoToARow.of("user", scene[2]))
+        refine(lambda *scene: TwoToARow.on("user", scene[2]))
 
 
 def of_offset(_: CarBatch, state: CarState) -> Tensor:
@@ -354,22 +352,22 @@ def test_a_residual_that_is_none_is_named() -> None:
 def test_what_begins_a_term_with_a_jacobian_needs_none_itself() -> None:
     class Begins(ResidualTerm):
         def begin(self, stage: Any, sight: Sight) -> Any:
-            return LowerTerm.of(self.names[0], self.cars)
+            return LowerTerm.on(self.names[0], self.cars)
 
-    found = refine(lambda *scene: Begins.of("user", scene[2]))
-    expected = refine(lambda *scene: LowerTerm.of("user", scene[2]))
+    found = refine(lambda *scene: Begins.on("user", scene[2]))
+    expected = refine(lambda *scene: LowerTerm.on("user", scene[2]))
     torch.testing.assert_close(found.T_cam_obj, expected.T_cam_obj, rtol=0, atol=0)
 
 
 class TensorTerm(LowerTerm):
     """A `TensorTerm` looks at rows of one tensor, without a tuple around it."""
 
-    def where(self, sight: Sight) -> Where:
+    def where(self, sight: Sight) -> Tensor:
         return torch.ones(len(self.blocks.owner), 1)
 
 
 def test_one_tensor_says_where_rows_look() -> None:
-    nowhere, looking = (refine(lambda *scene, kind=kind: kind.of("user", scene[2])) for kind in (LowerTerm, TensorTerm))
+    nowhere, looking = (refine(lambda *scene, kind=kind: kind.on("user", scene[2])) for kind in (LowerTerm, TensorTerm))
     torch.testing.assert_close(looking.T_cam_obj, nowhere.T_cam_obj, rtol=0, atol=0)
 
 

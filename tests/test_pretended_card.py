@@ -69,7 +69,7 @@ def test_iterations_let_the_host_wait_once_a_block_and_compactions_not_at_all(fo
     assert len({-(-count // waits["length of a block"]) for count in waits["iterations"]}) > 1
     assert waits["by place"] == {"tolist in _read": waits["blocks"]}
     # Tracks have one stage more. Where views leave, the places of the others are sent; nothing more is read.
-    assert set(_of(found, "waits of blocks of tracks")["by place"]) == {"tolist in _read", "aten.copy_ in of"}
+    assert set(_of(found, "waits of blocks of tracks")["by place"]) == {"tolist in _read", "aten.copy_ in from_numbers"}
 
 
 def test_a_whole_call_lets_the_host_wait_some_forty_times(found: dict[str, Any]) -> None:

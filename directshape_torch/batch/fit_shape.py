@@ -18,6 +18,7 @@ from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.numerics.checks import check_shape
 from directshape_torch.numerics.conversion import Given, as_floating
 from directshape_torch.numerics.full_precision import full_precision
+from directshape_torch.numerics.tables import Chosen
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rows import PointSamples
@@ -132,7 +133,7 @@ def _fitter(prior: ShapePrior | None, samples: PointSamples) -> DirectShapeRefin
 
     def point_term(_: FrameBatch, __: Detections, cars: CarBatch, ___: ShapePrior) -> PointCloud:
         is_kept = torch.zeros_like(samples.counts, dtype=torch.bool).index_fill(0, cars.detection_row, True)
-        return PointCloud.of_points(of_points, samples.of_objects(is_kept))
+        return PointCloud.of_points(of_points, samples.of(Chosen.where(is_kept)))
 
     return DirectShapeRefiner(prior, config, extra_terms=[point_term])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,6 +14,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.io.config_files import load_config
 from directshape_torch.laboratory.regimes import Draw, Regime, seeded
 from directshape_torch.laboratory.scenes import LaboratoryScene
+from directshape_torch.numerics.tables import Chosen, take_rows
 from directshape_torch.numerics.tensors import length, occurrences
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.refinement.problem import CarProblem, CarStage
@@ -27,7 +29,7 @@ from directshape_torch.state.unknowns import State
 from directshape_torch.terms.check_term import car_products, check_same
 from directshape_torch.terms.depth import closest_of_march, first_hits, march
 from directshape_torch.terms.silhouette import contour_zeta
-from directshape_torch.terms.term import Linear, Sight, Term, linear_of
+from directshape_torch.terms.term import AnyTerm, Linear, Sight, Term, WhereT, linear_of
 from directshape_torch.tracks.next_view import NEXT_VIEW_NAME
 from directshape_torch.tracks.path import MOTION_NAMES, timed
 from directshape_torch.tracks.share import in_tracks
@@ -54,10 +56,10 @@ class Bench:
 
     regime: Regime  # the regime of the states
     stage: CarStage  # begun, with default settings, a pose prior, points and the user's own terms
-    terms: Mapping[str, Term]  # by the laboratory's names, in all forms including the paper's
+    terms: Mapping[str, AnyTerm]  # by the laboratory's names, in all forms including the paper's
     state: CarState | TrackState  # of the B cars
     sight: Sight  # what the rays see of the state
-    rows: Mapping[str, Linear]  # residuals and factors of each term at the state
+    rows: Mapping[str, Linear[Any]]  # residuals and factors of each term at the state
 
     @property
     def problem(self) -> CarProblem:
@@ -123,7 +125,7 @@ class Bench:
 
 
 @torch.no_grad()
-def rows_at(term: Term, sight: Sight) -> Linear:
+def rows_at(term: Term[WhereT], sight: Sight) -> Linear[WhereT]:
     """The rows of a term at a state, with depths as precise as the dtype allows."""
     at = linear_of(term, sight.field, sight.state, term.where(sight))
     for _ in range(_LOOKS):
@@ -161,14 +163,14 @@ def _check_refused(
     own_terms: Sequence[TermFactory],
 ) -> None:
     """Raise `InputError` unless a user's terms give equal values for cars with and without the first car."""
-    keep = torch.arange(len(cars)) > 0
+    everybody, others = (Chosen.where(torch.arange(len(cars)) > car) for car in (-1, 0))
     all_cars, few = (
-        problem_of_scene(config, prior, scene.frame, detections, cars.of_cars(kept), seen.of_objects(kept), own_terms)
-        for kept in (torch.ones_like(keep), keep)
+        problem_of_scene(config, prior, scene.frame, detections, cars.of(kept), seen.of(kept), own_terms)
+        for kept in (everybody, others)
     )
-    for before, now in zip(all_cars.of_problems(keep).extra_terms, few.extra_terms, strict=True):
+    for before, now in zip(all_cars.of(others).extra_terms, few.extra_terms, strict=True):
         code = prior.initial_code(len(cars) - 1).to(cars.detector_T_cam_obj)
-        state = CarState.of(se3.inverse(cars.detector_T_cam_obj[keep]), code, cars.num_offsets)
+        state = CarState.of(se3.inverse(cars.detector_T_cam_obj[others.index]), code, cars.num_offsets)
         sight = few.look(state)
         stage = config.stages[0]
         products = [
@@ -184,12 +186,12 @@ def _of_a_track(problem: CarProblem, cars: CarBatch, state: CarState) -> CarProb
     number = torch.arange(len(cars))
     time_s = 0.1 * number.to(state.code)
     T_world_cam = se3.exp(time_s[:, None] * time_s.new_tensor([0.5, 0.0, 10.0, 0.0, 0.2, 0.0]))
-    sharing = Groups.of([0] * len(cars), *own_and_shared(state))
+    sharing = Groups.from_numbers([0] * len(cars), *own_and_shared(state))
     views = timed(sharing, replace(cars, time_s=time_s, T_world_cam=T_world_cam))
     return in_tracks(problem, sharing, views, state, sharing.everybody, (number + 1).clamp_max(len(cars) - 1))
 
 
-def _named(stage: CarStage, other_forms: CarStage) -> dict[str, Term]:
+def _named(stage: CarStage, other_forms: CarStage) -> dict[str, AnyTerm]:
     """The terms of a stage by name, with the other forms of two of them; a user's terms keep their names."""
     plain, other = (
         {"silhouettes" if len(t.names) > 1 else t.names[0]: t for t in s.terms} for s in (stage, other_forms)
@@ -255,4 +257,4 @@ def _at_most(pixels: PixelSamples, wanted: Tensor, count: int, generator: torch.
     for car in set(pixels.object_index.tolist()):
         rows = (wanted & (pixels.object_index == car)).nonzero()[:, 0]
         keep[rows[torch.randperm(len(rows), generator=generator)[:count]]] = True
-    return pixels.select(keep.nonzero()[:, 0])
+    return take_rows(pixels, keep.nonzero()[:, 0], "P")

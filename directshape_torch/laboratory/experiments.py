@@ -14,7 +14,7 @@ from torch import Tensor
 from directshape_torch.laboratory.bench import Bench
 from directshape_torch.laboratory.differences import Evaluate
 from directshape_torch.shape.field import field_of
-from directshape_torch.terms.term import Linear, Term, by_autograd, linear_of
+from directshape_torch.terms.term import Linear, Term, WhereT, by_autograd, linear_of
 
 # The samples of the paper's product lie between the bounds of the grid and move with the bounds. By definition they are
 # constants of a linearisation, so its Jacobian is the Jacobian of the residual at fixed samples.
@@ -101,18 +101,18 @@ def gradient_experiment(bench: Bench, names: Sequence[str]) -> Experiment:
     return Experiment(tuple(subjects), gradients, _units(bench))
 
 
-def jacobian(at: Linear) -> Tensor:
+def jacobian(at: Linear[WhereT]) -> Tensor:
     """`J_residual_state` (M, R, N, D)."""
     return at.J_residual_inner[..., None] * at.J_inner_state[:, :, None]
 
 
-def row_gradients(term: Term, at: Linear) -> Tensor:
+def row_gradients(term: Term[WhereT], at: Linear[WhereT]) -> Tensor:
     """Part (M, R, D) that each row adds to the gradient of its car, before the weight of its block."""
     inner = (term.row_weight * term.norm(at.residual).gradient_weight * at.J_residual_inner).sum(dim=-1)
     return inner[..., None] * at.J_inner_state
 
 
-def _counts(term: Term, at: Linear) -> Tensor:
+def _counts(term: Term[WhereT], at: Linear[WhereT]) -> Tensor:
     return (term.row_weight > 0).expand_as(at.residual)
 
 

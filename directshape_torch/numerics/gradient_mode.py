@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from torch.autograd.forward_ad import unpack_dual
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
+_T = TypeVar("_T")
 
 
 def nothing_is_differentiated() -> bool:
@@ -42,11 +43,11 @@ def as_constant(function: Callable[_P, _R]) -> Callable[_P, _R]:
     return call
 
 
-def map_tensors(change: Callable[..., Tensor], value: Any, *others: Any) -> Any:
+def map_tensors(change: Callable[..., Tensor], value: _T, *others: _T) -> _T:
     """A copy of nested named tuples with each tensor changed, together with its counterparts in `others`."""
     if isinstance(value, Tensor):
-        return change(value, *others)
-    if not value:
+        return cast(_T, change(value, *others))
+    if not isinstance(value, tuple) or not value:
         return value
     return type(value)(*(map_tensors(change, *parts) for parts in zip(value, *others, strict=True)))
 

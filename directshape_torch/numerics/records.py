@@ -21,15 +21,21 @@ class Dense:
         shape: sizes; a letter is any size, the same one wherever it stands in the record.
         kind: kind of the tensor's numbers.
         cure: advice where the tensor has another shape.
+        numbers_of: the letter whose rows the tensor numbers, if it does (see `tables`).
     """
 
-    def __init__(self, *shape: int | str, kind: Kind = "floating", cure: str = "") -> None:
-        self.shape, self.kind, self.cure = shape, kind, cure
+    def __init__(self, *shape: int | str, kind: Kind = "floating", cure: str = "", numbers_of: str = "") -> None:
+        self.shape, self.kind, self.cure, self.numbers_of = shape, "index" if numbers_of else kind, cure, numbers_of
 
     def check(self, name: str, value: Tensor, sizes: dict[int | str, int]) -> None:
         """Raise `InputError` unless a tensor is as declared; `sizes` has the sizes of letters and gets new ones."""
         check_shape(name, value, [sizes.get(size, size) for size in self.shape], self.cure, self.kind)
         sizes |= dict(zip(self.shape, value.shape, strict=True))
+
+
+def dense_of(hint: object) -> Dense | None:
+    """The declaration in the type of a field or of an argument, if there is one."""
+    return next((each for each in getattr(hint, "__metadata__", ()) if isinstance(each, Dense)), None)
 
 
 class DeclaredTensor(NamedTuple):

@@ -7,7 +7,8 @@ mode "adaptive" takes the pixel of each cell at which the image changes most, "u
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -15,6 +16,8 @@ from torch import Tensor
 from directshape_torch.config import SamplingConfig, SamplingMode
 from directshape_torch.geometry.projection import rays_from_pixels, right_rays
 from directshape_torch.image.grey_levels import gradient_magnitude_at, gradient_magnitude_of_part
+from directshape_torch.numerics.records import Dense
+from directshape_torch.numerics.tables import Table
 from directshape_torch.observation.occlusion import occlusion_map
 from directshape_torch.rows import OcclusionMap, PixelSamples, PointSamples
 from directshape_torch.scene import SIDES, Detections, FrameBatch, Side
@@ -24,20 +27,15 @@ _MARGIN_PX, _MARGIN_SHARE = 4.0, 0.1
 
 
 @dataclass(frozen=True)
-class Observation:
-    """An `Observation` is everything that the images show of B cars."""
+class Observation(Table):
+    """An `Observation` is everything that the images show of B cars, which are some of N detections."""
 
     left: PixelSamples  # packed pixels of the left image
     right: PixelSamples  # packed pixels of the right image
     # what hides cars in the right image, by row of the detections; None where it is not asked for
     hidden_right: OcclusionMap | None
-    mask_areas: Tensor  # (detections of the call, 2) foreground pixels of the left and right masks, 0 where absent
-    points: PointSamples | None = None  # points of dense stereo where a term fits them
-
-    def of_objects(self, keep: Tensor) -> Observation:
-        """The observation of the objects where `keep` (B,) holds; occlusion and areas still cover all detections."""
-        points = None if self.points is None else self.points.of_objects(keep)
-        return replace(self, left=self.left.of_objects(keep), right=self.right.of_objects(keep), points=points)
+    mask_areas: Annotated[Tensor, Dense("N", 2)]  # foreground pixels of the left and right masks, 0 where absent
+    points: PointSamples | None = None  # points of dense stereo, where a term fits them
 
 
 def pack_pixels(frames: FrameBatch, detections: Detections, config: SamplingConfig) -> Observation:

@@ -17,6 +17,7 @@ from directshape_torch.compile import compilable
 from directshape_torch.config import PhotometricConfig
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.records import CarRecord, Dense
+from directshape_torch.numerics.tables import take_rows
 from directshape_torch.numerics.tensors import made_once
 from directshape_torch.rows import CarSums, Rays
 from directshape_torch.terms.photometric import Photometric, Surface
@@ -256,24 +257,19 @@ def _thinned(term: Photometric, max_pixels: int) -> tuple[PhotometricRows, Tenso
     )
     along_ray, along_baseline, left, weight, neighbours = (x.flatten(-2)[..., place] for x in rows[1:6])
     weight = torch.where(step < counts[:, None], weight, torch.zeros_like(weight))
-    return PhotometricRows(rays, along_ray, along_baseline, left, weight, neighbours, rows.right.take(first)), place
+    right = take_rows(rows.right, first, "M")
+    return PhotometricRows(rays, along_ray, along_baseline, left, weight, neighbours, right), place
 
 
-@compilable(
-    sizes={
-        "owner": 0, "centre_cam": 0, "ray_cam": 1, "along_ray": 2, "along_baseline": 1, "intensity_left": 1,
-        "pixel_weight": 0, "neighbour_weight": 1, "pixels": 0, "frame": 0, "to_full": 0, "crop": 0, "in_front": 0,
-        "covering": 0, "parts": 1, "depth": 1, "on_surface": 1, "per_px": 0, "offsets_px": 0,
-    }
-)  # fmt: skip
+@compilable
 def shifted_costs(
     rows: PhotometricRows,
     config: PhotometricConfig,
-    parts: Tensor,  # (Q, B, R) which pixels count in each of Q costs, 0 or 1
-    depth: Tensor,  # (S, B, R) of S surfaces, metres
-    on_surface: Tensor,  # (S, B, R) bool
-    per_px: Tensor,  # (B,) inverse depth that a pixel of disparity is worth
-    offsets_px: Tensor,  # (n,)
+    parts: Annotated[Tensor, Dense("Q", "B", "R")],  # which pixels count in each of Q costs, 0 or 1
+    depth: Annotated[Tensor, Dense("S", "B", "R")],  # of S surfaces, metres
+    on_surface: Annotated[Tensor, Dense("S", "B", "R", kind="flags")],
+    per_px: Annotated[Tensor, Dense("B")],  # inverse depth that a pixel of disparity is worth
+    offsets_px: Annotated[Tensor, Dense("A")],
 ) -> Tensor:
     """Costs (Q, S, n, B), float64, of Q parts of the pixels of each car, with S surfaces moved by n disparities."""
     inverse = 1 / depth[:, None] + offsets_px[:, None, None] * per_px[:, None]

@@ -23,13 +23,12 @@ from directshape_torch.refinement.observability import (
     observability_of,
     without_offset,
 )
-from directshape_torch.refinement.problem import CarProblem, CarStage
+from directshape_torch.refinement.problem import CarMinimum, CarProblem, stage_of
 from directshape_torch.refinement.quality import fit_quality
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.trust import EVIDENCE_NAMES, bundled_trust_model
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.solver.sharing import INDEPENDENT
 from directshape_torch.state.cars import CarBatch
@@ -133,7 +132,7 @@ def at_states(result: RefinementResult, state: State) -> RefinementResult:
 
 
 def outcome_of(
-    problem: CarProblem, minimum: Minimum[AnyState], cars: CarBatch, came: RefinementResult
+    problem: CarProblem, minimum: CarMinimum[AnyState], cars: CarBatch, came: RefinementResult
 ) -> RefinementResult:
     """The result `came` with costs, covariance, quality, observability and profile of a minimum.
 
@@ -141,7 +140,7 @@ def outcome_of(
     the costs of the input.
     """
     end, refined = minimum.end, is_refined(minimum.status)
-    stage: CarStage = minimum.stage
+    stage = stage_of(minimum)
     before, after = minimum.before, _of_calibrated_rig(problem, minimum.after)
     kept = end.unknowns.span(POSE, CODE)
     # The other views of a track add what they say of its shape.
@@ -220,8 +219,8 @@ def _of_calibrated_rig(problem: CarProblem, figures: Figures) -> Figures:
 
 
 def judged(
-    minimum: Minimum[AnyState], initial: AnyState, found: RefinementResult, limits: AcceptanceConfig
-) -> tuple[Minimum[AnyState], RefinementResult]:
+    minimum: CarMinimum[AnyState], initial: AnyState, found: RefinementResult, limits: AcceptanceConfig
+) -> tuple[CarMinimum[AnyState], RefinementResult]:
     """Set the statuses by the figures, and give refused cars their input state back.
 
     An unknown probability does not refuse a car, but missing evidence does.
@@ -247,12 +246,12 @@ def judged(
     return replace(minimum, state=state, status=status), replace(found, status_code=status, quality=quality)
 
 
-def promised_decrease(minimum: Minimum[AnyState]) -> Tensor:
+def promised_decrease(minimum: CarMinimum[AnyState]) -> Tensor:
     """The decrease (B,) that a Gauss-Newton step at the end promises, as a share of the cost at the end."""
     after = minimum.after
     gradient, hessian = after.gradient.sum(dim=1), after.hessian.sum(dim=1)
-    at = minimum.stage.without_held(Evaluation(after.cost, gradient, hessian, ()))
-    share, members = minimum.stage.problem.sharing, is_refined(minimum.status)
+    stage, members = stage_of(minimum), is_refined(minimum.status)
+    at, share = stage.without_held(Evaluation(after.cost, gradient, hessian, ())), stage.problem.sharing
     step, solvable = share.damped_step(at.hessian, at.gradient, torch.zeros_like(at.cost), members)
     promised = -0.5 * share.total((at.gradient * step).sum(dim=1), members) / share.total(at.cost, members)
     return torch.where(solvable, promised, torch.inf)

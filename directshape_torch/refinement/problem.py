@@ -9,54 +9,54 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import cast
+from typing import Annotated, Any, TypeAlias, cast
 
 import torch
 from torch import Tensor
 
-from directshape_torch.compile import will_compile
+from directshape_torch.compile import will_compile, with_varying
 from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.numerics.gradient_mode import map_tensors
-from directshape_torch.rows import CarSums, Rays
+from directshape_torch.numerics.records import Dense
+from directshape_torch.numerics.tables import Chosen, Table
+from directshape_torch.rows import CarSums
 from directshape_torch.shape.field import Field, field_of
 from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.sharing import INDEPENDENT, Sharing
 from directshape_torch.state.unknowns import LARGEST_ROTATION_RAD, AnyState, State, Unknowns
 from directshape_torch.terms.depth import marched_views
-from directshape_torch.terms.photometric import Photometric
+from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.priors import with_joined_priors
 from directshape_torch.terms.silhouette import MaskRows
 from directshape_torch.terms.term import (
+    AnyTerm,
     Evaluation,
     Evidence,
     Figures,
     Part,
     Sight,
-    Term,
-    Where,
     by_autograd,
     linear_of,
     part_of,
     part_of_rows,
     parts_of,
     summed,
-    with_varying_blocks,
 )
 
 
 @dataclass(frozen=True)
-class CarProblem:
+class CarProblem(Table):
     """This `solver.Problem` minimises the sum of terms over pose and shape of B cars."""
 
     prior: ShapePrior  # the family of shapes
     evidence: tuple[Evidence, ...]  # what the summands of the energy are made of
-    extra_terms: tuple[Term, ...]  # a user's own summands, whose columns come last
+    extra_terms: tuple[AnyTerm, ...]  # a user's own summands, whose columns come last
     masks: MaskRows  # the rays of both images, left ones first, used by everything that looks at a state
-    rays: tuple[Rays, Rays]  # the rays of the left image and the rays of the right image
     config: RefinerConfig  # stages, trust region, samples per ray
     # These factors (B, T) multiply the columns of costs of each car in addition to the weights of the terms. None
     # stands for 1.
-    factors: Tensor | None = None
+    factors: Annotated[Tensor | None, Dense("B", "T")] = None
     sharing: Sharing = INDEPENDENT  # which cars share one shape
 
     @property
@@ -72,8 +72,8 @@ class CarProblem:
         return next((each for each in self.evidence if name in each.names), None)
 
     def parts(
-        self, terms: tuple[Term, ...], field: Field, state: State, wheres: tuple[Where, ...], fisher: bool = True
-    ) -> tuple[Part, ...]:
+        self, terms: tuple[AnyTerm, ...], field: Field, state: State, wheres: tuple[object, ...], fisher: bool = True
+    ) -> tuple[Part[Any], ...]:
         """What terms of the problem, for all or fewer cars, say of a state; `fisher` asks for the Fisher information.
 
         The library's terms are evaluated in one function, which is compiled as a whole. A user's terms are evaluated
@@ -91,7 +91,7 @@ class CarProblem:
         with torch.no_grad():
             field = field_of(self.prior.bind(state.code))
             bounds, num_samples = self.prior.bounds_obj, self.config.silhouette.samples_per_ray
-            views = marched_views(*self.rays, bounds, num_samples, field, state.T_obj_cam)
+            views = marched_views(*self.masks.of_sides, bounds, num_samples, field, state.T_obj_cam)
         return Sight(state, field_of(self.prior.bind(state.code)) if torch.is_grad_enabled() else field, *views)
 
     def begin(self, stage: int, sight: Sight) -> CarStage:
@@ -102,24 +102,6 @@ class CarProblem:
         terms = tuple(each.begin(config, sight) for each in (*self.evidence, *self.extra_terms))
         return CarStage(self, config, terms, after_wider, sight.state.unknowns)
 
-    def of_problems(self, keep: Tensor) -> CarProblem:
-        """The problem of the cars where `keep` (B,) holds."""
-        numbers = keep.nonzero()[:, 0].tolist()
-        masks = self.masks.of_cars(keep, numbers)
-        evidence = tuple(each.of_cars(keep, numbers) for each in self.evidence)
-        extra = tuple(term.of_cars(keep, numbers) for term in self.extra_terms)
-        factors = None if self.factors is None else self.factors[keep]
-        sharing = self.sharing.of_problems(numbers)
-        return replace(
-            self,
-            evidence=evidence,
-            extra_terms=extra,
-            masks=masks,
-            rays=masks.of_sides(),
-            factors=factors,
-            sharing=sharing,
-        )
-
 
 @dataclass(frozen=True)
 class CarStage:
@@ -127,7 +109,7 @@ class CarStage:
 
     problem: CarProblem  # of B cars
     config: StageConfig  # of the stage
-    terms: tuple[Term, ...]  # with pixel sets, counts and widths fixed
+    terms: tuple[AnyTerm, ...]  # with pixel sets, counts and widths fixed
     after_wider: bool  # an earlier stage had a wider contour
     unknowns: Unknowns  # of each car
 
@@ -136,12 +118,12 @@ class CarStage:
         """The photometric term, which the disparity profile is made of."""
         return cast("Photometric | None", self.term("photometric"))
 
-    def term(self, name: str) -> Term | None:
+    def term(self, name: str) -> AnyTerm | None:
         """The library's term that fills the column `name`; None if it has no part in the energy."""
         own = self.terms[: len(self.problem.evidence)]
         return next((term for term in own if name in term.names), None)
 
-    def photometric_part(self, figures: Figures) -> Part | None:
+    def photometric_part(self, figures: Figures) -> Part[Surface] | None:
         """What the photometric term says among the figures of a state."""
         return next((at for term, at in zip(self.terms, figures.parts, strict=True) if term is self.photometric), None)
 
@@ -158,9 +140,9 @@ class CarStage:
         return torch.stack(seen).sum(dim=0) if seen else None
 
     @cached_property
-    def _constant_terms(self) -> tuple[Term, ...]:
+    def _constant_terms(self) -> tuple[AnyTerm, ...]:
         """The terms in the form of compiled code, in which they are constants; `terms` may be differentiated."""
-        return tuple(with_varying_blocks(term) for term in self.terms)
+        return tuple(with_varying(term) for term in self.terms)
 
     def figures(self, sight: Sight) -> Figures:
         """The energy of each column at a state, with every ray marched; differentiable if gradients are enabled."""
@@ -198,10 +180,12 @@ class CarStage:
             terms, wheres, costs = (tuple(x) for x in zip(*moving, strict=True))
             by_column = torch.cat(costs, dim=1)
             rest = (by_column if problem.factors is None else by_column * problem.factors).sum(dim=1)
-        iterations = CarIterations.of(self, terms, rest, problem.factors, problem.masks, problem.sharing)
+        # Rays are marched again only where nothing is known to rest.
+        masks = problem.masks if rest is None else None
+        iterations = CarIterations(self, terms, rest, problem.factors, masks, problem.sharing)
         return iterations, iterations.evaluated(sight.field, sight.state, wheres)
 
-    def _iterated_terms(self) -> tuple[Term, ...]:
+    def _iterated_terms(self) -> tuple[AnyTerm, ...]:
         """The terms with the library's priors joined, if cars have no factors; a user's terms stay separate.
 
         Compiled code does not join priors: it has one form for this and for `figures`, and separate priors cost nothing
@@ -252,12 +236,14 @@ class _Layout:
     column: Tensor  # (M,) of the costs
     weight: Tensor  # (M,) float64
     information: Tensor  # (M,) float64
+    num_blocks: list[int]  # of each term
     num_cars: int
     num_columns: int
 
     @classmethod
-    def of(cls, terms: Sequence[Term], factors: Tensor | None) -> _Layout:
-        owner = torch.cat([term.blocks.owner for term in terms])
+    def of(cls, terms: Sequence[AnyTerm], factors: Tensor | None) -> _Layout:
+        owners = [term.blocks.owner for term in terms]
+        owner = torch.cat(owners)
         first = [sum(len(term.names) for term in terms[:n]) for n in range(len(terms))]
         column = torch.cat([term.column + n for term, n in zip(terms, first, strict=True)])
         weight, information = (
@@ -267,7 +253,8 @@ class _Layout:
             factor = factors.to(torch.float64)[owner, column]
             weight, information = weight * factor, information * factor
         num_columns = sum(len(term.names) for term in terms)
-        return cls(owner, column, weight, information, len(terms[0].blocks.counts), num_columns)
+        num_blocks, num_cars = [len(owner) for owner in owners], len(terms[0].blocks.counts)
+        return cls(owner, column, weight, information, num_blocks, num_cars, num_columns)
 
     def sums(self) -> CarSums:
         """Sums over the blocks of each car."""
@@ -275,48 +262,46 @@ class _Layout:
 
 
 @dataclass(frozen=True)
-class CarIterations:
-    """This `solver.StageProblem` holds the cars of a stage that still move."""
+class CarIterations(Table):
+    """These `solver.Iterations` hold the cars of a stage that still move."""
 
     stage: CarStage  # of all cars of the problem
-    terms: tuple[Term, ...]  # of the B cars that still move, with the rows that can still change
-    layout: _Layout  # of the blocks of these terms
-    sums: CarSums  # over these blocks
-    rest: Tensor | None  # (B,) cost of rows that cannot change; None if every row is marched at every state
-    factors: Tensor | None  # see `CarProblem`; this also holds for `masks` and `sharing`
-    masks: MaskRows
+    terms: tuple[AnyTerm, ...]  # of the B cars that still move, with the rows that can still change
+    rest: Annotated[Tensor | None, Dense("B")]  # cost of rows that cannot change; None if all rows are marched
+    factors: Annotated[Tensor | None, Dense("B", "T")]  # see `CarProblem`; this also holds for `sharing`
+    masks: MaskRows | None  # rays that are marched at every state; None if rays are tracked
     sharing: Sharing
 
-    @classmethod
-    def of(
-        cls,
-        stage: CarStage,
-        terms: tuple[Term, ...],
-        rest: Tensor | None,
-        factors: Tensor | None,
-        masks: MaskRows,
-        sharing: Sharing,
-    ) -> CarIterations:
-        layout, terms = _Layout.of(terms, factors), tuple(with_varying_blocks(term) for term in terms)
-        return cls(stage, terms, layout, layout.sums(), rest, factors, masks, sharing)
+    @cached_property
+    def layout(self) -> _Layout:
+        """The blocks of the terms."""
+        return _Layout.of(self.terms, self.factors)
+
+    @cached_property
+    def _sums(self) -> CarSums:
+        return self.layout.sums()
+
+    @cached_property
+    def _constant_terms(self) -> tuple[AnyTerm, ...]:
+        return tuple(with_varying(term) for term in self.terms)
 
     def evaluate(self, state: State, near: Evaluation) -> Evaluation:
         """The energy at a state; the terms look near the points of the evaluation `near`."""
         problem = self.stage.problem
-        if self.rest is None:
-            sight = replace(problem, masks=self.masks, rays=self.masks.of_sides()).look(state)
+        if self.masks is not None:
+            sight = replace(problem, masks=self.masks).look(state)
             return self.evaluated(sight.field, state, tuple(term.where(sight) for term in self.terms))
         return self.evaluated(field_of(problem.prior.bind(state.code)), state, near.wheres)
 
-    def evaluated(self, field: Field, state: State, wheres: tuple[Where, ...]) -> Evaluation:
+    def evaluated(self, field: Field, state: State, wheres: tuple[object, ...]) -> Evaluation:
         """The energy at a state; the terms look near the points `wheres`."""
-        problem, terms = self.stage.problem, self.terms
+        problem, terms = self.stage.problem, self._constant_terms
         parts = problem.parts(terms, field, state, wheres, fisher=False)
         if problem.config.solver.jacobian == "autograd":
             looked = [part.where for part in parts]
             rows = by_autograd(terms, problem.prior, state, looked)
             parts = tuple(part_of_rows(t, *r, where) for t, r, where in zip(terms, rows, looked, strict=True))
-        at = summed(self.sums, self.layout.weight, parts)
+        at = summed(self._sums, self.layout.weight, parts)
         cost = at.cost if self.rest is None else at.cost + self.rest
         return self.stage.without_held(at._replace(cost=cost))
 
@@ -325,32 +310,34 @@ class CarIterations:
         conditions = accepted, accepted[:, None], accepted[:, None, None]
         cost, gradient, hessian = (torch.where(*x) for x in zip(conditions, new[:3], old[:3], strict=True))
 
-        def chosen(term: Term, new: Where, old: Where) -> Where:
-            if isinstance(new, tuple) and not new:  # looks nowhere
-                return new
-            in_blocks = accepted[term.blocks.owner][:, None]
-            return map_tensors(lambda x, y: torch.where(in_blocks, x, y), new, old)
+        of_blocks = accepted[self.layout.owner, None].split_with_sizes(self.layout.num_blocks)
 
-        return Evaluation(cost, gradient, hessian, tuple(map(chosen, self.terms, new.wheres, old.wheres)))
+        def chosen(accepted: Tensor, new: object, old: object) -> object:
+            return map_tensors(lambda x, y: torch.where(accepted, x, y), new, old)
+
+        return Evaluation(cost, gradient, hessian, tuple(map(chosen, of_blocks, new.wheres, old.wheres)))
 
     def retract(self, state: AnyState, step: Tensor) -> AnyState:
         """The state moved by tangent vectors (B, D) within the trust region."""
         max_code = self.stage.problem.config.solver.max_code
         return self.stage.unknowns.retract(state, step, max_code, LARGEST_ROTATION_RAD)
 
-    def of_problems(self, keep: Tensor, numbers: Sequence[int], at: Evaluation) -> tuple[CarIterations, Evaluation]:
-        """The iterations and the evaluation of the cars where `keep` (B,) holds; these cars have the `numbers`."""
-        index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
+    def evaluation_of(self, cars: Chosen, at: Evaluation) -> Evaluation:
+        """The evaluation of some of the cars."""
+        cost, gradient, hessian = (x.index_select(0, cars.index) for x in at[:3])
 
-        def kept(term: Term, where: Where) -> Where:
-            if isinstance(where, tuple) and not where:
-                return where
-            blocks = term.blocks.of_cars(keep, numbers)[1]
+        def kept(term: AnyTerm, where: object) -> object:
+            blocks = term.blocks.kept(cars)
             return map_tensors(lambda x: x.index_select(-2, blocks), where)
 
-        rest, factors = (None if x is None else x.index_select(0, index) for x in (self.rest, self.factors))
-        masks = self.masks if self.rest is not None else self.masks.of_cars(keep, numbers)
-        terms = tuple(term.of_cars(keep, numbers) for term in self.terms)
-        cost, gradient, hessian = (x.index_select(0, index) for x in at[:3])
-        iterations = CarIterations.of(self.stage, terms, rest, factors, masks, self.sharing.of_problems(numbers))
-        return iterations, Evaluation(cost, gradient, hessian, tuple(map(kept, self.terms, at.wheres)))
+        return Evaluation(cost, gradient, hessian, tuple(map(kept, self.terms, at.wheres)))
+
+
+CarMinimum: TypeAlias = Minimum[AnyState, Sight, Evaluation, Figures]
+"""A `CarMinimum` is the result of minimising a `CarProblem`."""
+
+
+def stage_of(minimum: CarMinimum[AnyState]) -> CarStage:
+    """The last stage that has begun, of all cars."""
+    assert isinstance(minimum.stage, CarStage)
+    return minimum.stage

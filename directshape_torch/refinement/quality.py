@@ -13,7 +13,7 @@ from directshape_torch.numerics.records import CarRecord, Dense
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refinement.trust import bundled_trust_model
 from directshape_torch.rows import CarSums
-from directshape_torch.terms.photometric import Photometric
+from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.silhouette import MaskRows
 from directshape_torch.terms.term import Figures, Part, Sight
 
@@ -96,7 +96,7 @@ def mask_ious(masks: MaskRows, seen: Sight) -> Tensor:
     return torch.where(union > 0, overlap / union, torch.nan).view(2, num_cars)
 
 
-def photometric_agreement(term: Photometric, at: Part) -> tuple[Tensor, Tensor, Tensor]:
+def photometric_agreement(term: Photometric, at: Part[Surface]) -> tuple[Tensor, Tensor, Tensor]:
     """Measure the mean absolute residual (B,) of the usable pixels, their share (B,) of the set, and their contrast.
 
     Residual and contrast are in grey levels. The contrast (B,) is the mean absolute deviation of grey levels from the

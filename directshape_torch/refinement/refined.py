@@ -8,12 +8,13 @@ from typing import Generic
 import torch
 from torch import Tensor
 
+from directshape_torch.numerics.tables import Chosen, take_rows
 from directshape_torch.refinement.outcome import at_states, judged, outcome_of
-from directshape_torch.refinement.problem import CarProblem
+from directshape_torch.refinement.problem import CarMinimum, CarProblem
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.solver.differentiate import implicit_state, unrolled_state
-from directshape_torch.solver.gauss_newton import Minimum, minimise
-from directshape_torch.solver.problem import put_rows, take_rows, where_rows
+from directshape_torch.solver.gauss_newton import minimise
+from directshape_torch.solver.problem import put_rows, where_rows
 from directshape_torch.state.cars import CarBatch
 from directshape_torch.state.unknowns import AnyState
 from directshape_torch.status import Status, is_refined
@@ -25,7 +26,7 @@ class Refined(Generic[AnyState]):
 
     problem: CarProblem
     cars: CarBatch
-    minimum: Minimum[AnyState]
+    minimum: CarMinimum[AnyState]
     found: RefinementResult  # what is said of every car where its iterations ended
 
     @classmethod
@@ -61,10 +62,11 @@ class Refined(Generic[AnyState]):
         """
         minimum = self.minimum if ends is None else _at_ends(self.minimum, ends)
         wanted = is_refined(minimum.status)
-        rows = wanted.nonzero()[:, 0]
-        if not torch.is_grad_enabled() or not len(rows):
+        if not torch.is_grad_enabled() or not bool(wanted.any()):
             return minimum.state
-        part, backward, names = self.problem.of_problems(wanted), self.problem.config.backward, self.cars.detection_row
+        chosen = Chosen.where(wanted)
+        part, rows = self.problem.of(chosen), chosen.index
+        backward, names = self.problem.config.backward, self.cars.detection_row
         if backward.mode == "unroll":
             first = take_rows(start, rows)
             state = unrolled_state(part, first, minimum, rows, backward.unroll_iterations, names[rows])
@@ -74,6 +76,6 @@ class Refined(Generic[AnyState]):
         return put_rows(minimum.state, rows, state)
 
 
-def _at_ends(minimum: Minimum[AnyState], ends: Tensor) -> Minimum[AnyState]:
+def _at_ends(minimum: CarMinimum[AnyState], ends: Tensor) -> CarMinimum[AnyState]:
     status = torch.where(ends, Status.converged.code, Status.rejected_worse.code)
     return replace(minimum, state=where_rows(ends, minimum.end, minimum.state), status=status)

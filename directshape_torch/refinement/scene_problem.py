@@ -28,11 +28,11 @@ from directshape_torch.terms.photometric_rows import LeftPixels
 from directshape_torch.terms.point_cloud import PointCloud
 from directshape_torch.terms.priors import prior_terms
 from directshape_torch.terms.silhouette import MaskRows, SilhouetteEvidence
-from directshape_torch.terms.term import Evidence, Term
+from directshape_torch.terms.term import AnyTerm, Evidence
 
 _WEIGHTS = "silhouette.weight, photometric.weight, point_cloud.weight, priors.*_weight"
 
-TermFactory: TypeAlias = Callable[[FrameBatch, Detections, CarBatch, ShapePrior], Term]
+TermFactory: TypeAlias = Callable[[FrameBatch, Detections, CarBatch, ShapePrior], AnyTerm]
 """It makes a user's term for some cars of a call from the frames, all detections, the cars to refine and the prior."""
 
 
@@ -66,19 +66,19 @@ def problem_of_scene(
         evidence.append(SilhouetteEvidence(config.silhouette, cars, masks, prior.bounds_obj))
     if config.photometric.weight > 0:
         pyramid = _pyramid(frames, max(stage.image_level for stage in config.stages))
-        left = LeftPixels.of(pixels[0], sides[0], pyramid, observation.hidden_right, detections.mask_left)
+        left = LeftPixels(pixels[0], sides[0], pyramid, observation.hidden_right, detections.mask_left)
         evidence.append(PhotometricEvidence(config.photometric, cars, left))
     evidence += prior_terms(config.priors, prior, cars)
     extra = [_made(make, frames, detections, cars, prior) for make in extra_terms]
     if not evidence and not extra:
         raise ConfigError(f"expected a term of weight above 0, got none: {_WEIGHTS}")
-    problem = CarProblem(prior, tuple(evidence), tuple(extra), masks, masks.of_sides(), config)
+    problem = CarProblem(prior, tuple(evidence), tuple(extra), masks, config)
     _check_extra(problem, cars)
     factors = _factors(term_weights, problem.term_names, prior.initial_code(len(detections)).to(frames.images_left))
     return problem if factors is None else replace(problem, factors=factors[cars.detection_row])
 
 
-def _made(make: TermFactory, frames: FrameBatch, detections: Detections, cars: CarBatch, prior: ShapePrior) -> Term:
+def _made(make: TermFactory, frames: FrameBatch, detections: Detections, cars: CarBatch, prior: ShapePrior) -> AnyTerm:
     """Make a user's term; errors of the factory are named, because tensors of all detections do not fit the cars."""
     called = f"extra term of {getattr(make, '__qualname__', type(make).__name__)}"
     cure = "the cars are the rows cars.detection_row of the detections: take these rows of other tensors too"
@@ -100,11 +100,11 @@ def _check_extra(problem: CarProblem, cars: CarBatch) -> None:
         names += term.names
 
 
-def _pyramid(frames: FrameBatch, num_halvings: int) -> list[GreyPair]:
+def _pyramid(frames: FrameBatch, num_halvings: int) -> tuple[GreyPair, ...]:
     pyramid = [GreyPair(grey_levels(frames.images_left), grey_levels(frames.images_right), frames.sizes, 1.0)]
     for _ in range(num_halvings):
         pyramid.append(pyramid[-1].halved())
-    return pyramid
+    return tuple(pyramid)
 
 
 def _factors(weights: Mapping[str, Tensor] | None, names: Sequence[str], code: Tensor) -> Tensor | None:

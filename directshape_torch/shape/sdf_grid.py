@@ -17,7 +17,7 @@ derivative of the least distance is then the derivative at the fixed point, with
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Self, TypeAlias
+from typing import Annotated, NamedTuple, Self, TypeAlias
 
 import torch
 from torch import Tensor
@@ -25,6 +25,7 @@ from torch.nn.functional import embedding
 
 from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
+from directshape_torch.numerics.records import Dense
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.shape.shape_prior import SdfDerivatives
 
@@ -50,7 +51,7 @@ class GridShape(NamedTuple):
         tensor([0.5000])
     """
 
-    values: Tensor  # (B, nx, ny, nz) signed distance at the nodes, metres
+    values: Annotated[Tensor, Dense("B", "nx", "ny", "nz")]  # signed distance at the nodes, metres
     basis: Tensor  # (nx, ny, nz, K) derivative of the nodes by the code, metres per standard deviation
     origin: Tensor  # (3,) position of node (0, 0, 0) in the object frame, metres
     # (3,) number of the last node along each axis; a tensor, because the compiler turns constants into choices, which

@@ -12,15 +12,18 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from directshape_torch.numerics.tables import take_rows
 from directshape_torch.solver.damped_solve import limit_step, step_size
 from directshape_torch.solver.gauss_newton import Iteration, Minimum
 from directshape_torch.solver.problem import (
-    BegunStage,
     EnergyAt,
+    EvaluationT,
+    FiguresT,
     Problem,
+    SightT,
+    Stage,
     StateT,
     remade,
-    take_rows,
     where_rows,
 )
 
@@ -34,9 +37,9 @@ class StartNotReachedWarning(UserWarning):
 
 
 def unrolled_state(
-    problem: Problem[StateT],
+    problem: Problem[StateT, SightT, EvaluationT, FiguresT],
     start: StateT,
-    minimum: Minimum[StateT],
+    minimum: Minimum[StateT, SightT, EvaluationT, FiguresT],
     rows: Tensor,
     num_iterations: int,
     names: Tensor | None = None,
@@ -56,7 +59,7 @@ def unrolled_state(
     Returns:
         States of the R problems: the values of `minimum`, the derivatives of the repeated steps.
     """
-    trajectory = [_rows_of(iteration, rows) for iteration in minimum.trajectory]
+    trajectory = [take_rows(iteration, rows) for iteration in minimum.trajectory]
     if not trajectory:
         return _with_values(take_rows(minimum.state, rows), start)
     led_to_the_end = _steps_that_led_to_the_end(trajectory)
@@ -102,8 +105,8 @@ def _first_states(trajectory: Sequence[Iteration[StateT]], repeated: Tensor) -> 
 
 
 def implicit_state(
-    problem: Problem[StateT],
-    minimum: Minimum[StateT],
+    problem: Problem[StateT, SightT, EvaluationT, FiguresT],
+    minimum: Minimum[StateT, SightT, EvaluationT, FiguresT],
     rows: Tensor,
     *,
     exact: bool,
@@ -147,7 +150,7 @@ def implicit_state(
 
 
 def _gradient_and_its_jacobian(
-    stage: BegunStage[StateT], state: StateT, delta: Tensor, exact: bool
+    stage: Stage[StateT, SightT, EvaluationT, FiguresT], state: StateT, delta: Tensor, exact: bool
 ) -> tuple[EnergyAt, Tensor]:
     """The gradient g with its graph to the problem, and its Jacobian (R, D, D) by the tangent, without a graph."""
     if not exact:
@@ -187,8 +190,8 @@ def _listed(numbers: Sequence[int]) -> str:
 
 
 def _step(
-    problem: Problem[StateT],
-    stage: BegunStage[StateT],
+    problem: Problem[StateT, SightT, EvaluationT, FiguresT],
+    stage: Stage[StateT, SightT, EvaluationT, FiguresT],
     state: StateT,
     iteration: Iteration[StateT],
 ) -> StateT:
@@ -198,17 +201,6 @@ def _step(
     step = step * iteration.lengths[:, None]
     size = problem.sharing.largest(step_size(step, stage.step_limits().to(step)), together)
     return stage.retract(state, limit_step(step, size))
-
-
-def _rows_of(iteration: Iteration[StateT], rows: Tensor) -> Iteration[StateT]:
-    return Iteration(
-        iteration.stage,
-        take_rows(iteration.state, rows),
-        iteration.damping[rows],
-        iteration.lengths[rows],
-        iteration.accepted[rows],
-        iteration.improved[rows],
-    )
 
 
 def _with_values(values: StateT, graph: StateT) -> StateT:

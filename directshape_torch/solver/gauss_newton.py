@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Generic
+from typing import Annotated, Generic
 
 import torch
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig, StageConfig
 from directshape_torch.numerics.full_precision import full_precision
+from directshape_torch.numerics.records import Dense
+from directshape_torch.numerics.tables import Chosen, Table
 from directshape_torch.solver.iteration import RUNNING, IterationOutcome, begin, has_failed, iterate, step_lengths
 from directshape_torch.solver.problem import (
-    BegunStage,
+    EvaluationT,
+    FiguresT,
     Problem,
+    SightT,
+    Stage,
     StateT,
     put_rows,
     where_rows,
@@ -26,19 +32,19 @@ _WORTH_LEAVING_OUT = 16
 
 
 @dataclass(frozen=True)
-class Iteration(Generic[StateT]):
+class Iteration(Table, Generic[StateT]):
     """An `Iteration` holds what must be known to repeat one iteration of all B problems."""
 
     stage: int  # number of the stage
     state: StateT  # states before the iteration
-    damping: Tensor  # (B,) Marquardt's mu
-    lengths: Tensor  # (B,) what the steps were multiplied by, before their limits
-    accepted: Tensor  # (B,) bool: the step was taken; false for problems that took no part
-    improved: Tensor  # (B,) bool: the step led to the best state of the stage so far
+    damping: Annotated[Tensor, Dense("B")]  # Marquardt's mu
+    lengths: Annotated[Tensor, Dense("B")]  # what the steps were multiplied by, before their limits
+    accepted: Annotated[Tensor, Dense("B", kind="flags")]  # the step was taken; false for problems that took no part
+    improved: Annotated[Tensor, Dense("B", kind="flags")]  # the step led to the best state of the stage so far
 
 
 @dataclass(frozen=True)
-class Minimum(Generic[StateT]):
+class Minimum(Generic[StateT, SightT, EvaluationT, FiguresT]):
     """A `Minimum` is the result of a minimisation."""
 
     state: StateT  # final states, which are the input states where the status says so
@@ -49,10 +55,10 @@ class Minimum(Generic[StateT]):
     # Costs of different stages are not comparable
     cost_history: Tensor
     stage_starts: tuple[StateT, ...]  # states at which each stage began and fixed its sets
-    stage: Any  # the last stage that has begun, of all problems
-    seen_end: Any  # what the problem's `look` gave where the iterations ended
-    before: Any  # the last stage's figures at the input states
-    after: Any  # the last stage's figures where the iterations ended
+    stage: Stage[StateT, SightT, EvaluationT, FiguresT]  # the last stage that has begun, of all problems
+    seen_end: SightT  # what the problem's `look` gave where the iterations ended
+    before: FiguresT  # the last stage's figures at the input states
+    after: FiguresT  # the last stage's figures where the iterations ended
     trajectory: tuple[Iteration[StateT], ...] = ()  # all iterations in order, if they were asked for
 
 
@@ -103,22 +109,14 @@ class _Log(Generic[StateT]):
         self.costs, self.running = [], []
 
 
-@dataclass(frozen=True)
-class _Unfailed:
-    """These problems had not failed when the host last read how they ended: a mask (B,) and their numbers."""
-
-    keep: Tensor
-    numbers: list[int]
-
-
 @full_precision()
 def minimise(
-    problem: Problem[StateT],
+    problem: Problem[StateT, SightT, EvaluationT, FiguresT],
     initial: StateT,
     config: SolverConfig,
     start: StateT | None = None,
     record: bool = False,
-) -> Minimum[StateT]:
+) -> Minimum[StateT, SightT, EvaluationT, FiguresT]:
     """Run the stages of a problem one after the other, then compare the outcome with the input.
 
     Numerical trouble never raises: the problem concerned gets a status and its input state, the others go on.
@@ -136,7 +134,7 @@ def minimise(
         num_problems = len(initial[0])
         ended = torch.full((num_problems,), RUNNING, device=initial[0].device)
         iterations = torch.zeros_like(ended)
-        unfailed = _Unfailed(ended < 0, list(range(num_problems)))
+        unfailed = Chosen(ended < 0, range(num_problems))
         history: list[Tensor] = []
         starts: list[StateT] = []
         trajectory: list[Iteration[StateT]] | None = [] if record else None
@@ -169,26 +167,26 @@ def minimise(
 
 
 def _run_stage(
-    begun: BegunStage[StateT],
+    begun: Stage[StateT, SightT, EvaluationT, FiguresT],
     stage: StageConfig,
     state: StateT,
-    seen: Any,
+    seen: SightT,
     ended: Tensor,
-    unfailed: _Unfailed,
+    unfailed: Chosen,
     config: SolverConfig,
     log: _Log[StateT],
-) -> tuple[StateT, Tensor, Tensor, _Unfailed]:
-    """States, ends and iterations of all problems after a stage, and the problems that have not failed."""
+) -> tuple[StateT, Tensor, Tensor, Chosen]:
+    """States, ends and iterations of all problems after a stage, and those that had not failed when the host looked."""
     iterations = torch.zeros_like(ended)
-    numbers = unfailed.numbers
+    numbers: Sequence[int] = unfailed.numbers
     if not numbers:
         return state, ended, iterations, unfailed
     part, at_state = begun.start(seen)
     progress = begin(state, at_state, ended, config)
     rows = torch.arange(len(ended), device=ended.device)
     if len(numbers) < len(ended):
-        rows = torch.nonzero_static(unfailed.keep, size=len(numbers))[:, 0]
-        part, progress = progress.take(part, unfailed.keep, numbers)
+        rows = unfailed.index
+        part, progress = progress.narrowed(part, unfailed)
     limits = begun.step_limits().to(progress.at_state.gradient)
     failed: set[int] = set()
     done = 0
@@ -207,12 +205,12 @@ def _run_stage(
         if (len(numbers) - len(places)) * (stage.max_iterations - done) >= _WORTH_LEAVING_OUT:
             state, ended, iterations = progress.scatter(rows, state, ended, iterations)
             numbers = [numbers[place] for place in places]
-            keep = progress.ended < 0
-            rows = rows[torch.nonzero_static(keep, size=len(places))[:, 0]]
-            part, progress = progress.take(part, keep, places)
+            going_on = Chosen(progress.ended < 0, places)
+            rows = rows[going_on.index]
+            part, progress = progress.narrowed(part, going_on)
     state, ended, iterations = progress.scatter(rows, state, ended, iterations)
     if done:
-        unfailed = _Unfailed(~has_failed(ended), [number for number in unfailed.numbers if number not in failed])
+        unfailed = Chosen(~has_failed(ended), [number for number in unfailed.numbers if number not in failed])
     return state, ended, iterations, unfailed
 
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Annotated, Generic, NamedTuple
 
 import torch
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig
+from directshape_torch.numerics.records import Dense
+from directshape_torch.numerics.tables import Chosen, Table
 from directshape_torch.solver.damped_solve import is_finite, limit_step, step_size
-from directshape_torch.solver.problem import EnergyAt, StageProblem, StateT, put_rows, take_rows, where_rows
+from directshape_torch.solver.problem import EnergyAt, EvaluationT, Iterations, StateT, put_rows, where_rows
 from directshape_torch.status import Status
 
 
@@ -58,27 +59,25 @@ class IterationOutcome(NamedTuple):
 
 
 @dataclass
-class Progress(Generic[StateT]):
+class Progress(Table, Generic[StateT, EvaluationT]):
     """`Progress` is what changes from iteration to iteration, for the problems of one compacted batch."""
 
     state: StateT
     best_state: StateT
-    best_cost: Tensor  # (B,)
-    at_state: Any  # `EnergyAt`
-    damping: Tensor  # (B,)
-    stretched: Tensor  # (B,) bool: whether the next step is over-relaxed, in stages that over-relax
-    ended: Tensor  # (B,) status code or RUNNING
-    iterations: Tensor  # (B,)
+    best_cost: Annotated[Tensor, Dense("B")]
+    at_state: EvaluationT  # only the iterations know its axes
+    damping: Annotated[Tensor, Dense("B")]
+    # whether the next step is over-relaxed, in stages that over-relax
+    stretched: Annotated[Tensor, Dense("B", kind="flags")]
+    ended: Annotated[Tensor, Dense("B", kind="index")]  # status code or RUNNING
+    iterations: Annotated[Tensor, Dense("B", kind="index")]
 
-    def take(
-        self, problem: StageProblem[StateT], keep: Tensor, numbers: Sequence[int]
-    ) -> tuple[StageProblem[StateT], Progress[StateT]]:
-        """The problems where `keep` (B,) holds, which are at the places `numbers`, and their progress."""
-        index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
-        part, at_state = problem.of_problems(keep, numbers, self.at_state)
-        state, best_state = (take_rows(state, index) for state in (self.state, self.best_state))
-        others = (self.damping, self.stretched, self.ended, self.iterations)
-        return part, Progress(state, best_state, self.best_cost[index], at_state, *(x[index] for x in others))
+    def narrowed(
+        self, iterations: Iterations[StateT, EvaluationT], problems: Chosen
+    ) -> tuple[Iterations[StateT, EvaluationT], Progress[StateT, EvaluationT]]:
+        """The iterations of some of the problems, and their progress."""
+        at_state = iterations.evaluation_of(problems, self.at_state)
+        return iterations.of(problems), replace(self.of(problems), at_state=at_state)
 
     def scatter(self, rows: Tensor, state: StateT, ended: Tensor, iterations: Tensor) -> tuple[StateT, Tensor, Tensor]:
         """Best states, ends and iterations of all problems, with this batch put into its rows."""
@@ -99,7 +98,7 @@ def has_failed(ended: Tensor) -> Tensor:
     return (ended >= 0) & (ended != Status.converged.code)
 
 
-def begin(state: StateT, at_state: Any, ended: Tensor, config: SolverConfig) -> Progress[StateT]:
+def begin(state: StateT, at_state: EvaluationT, ended: Tensor, config: SolverConfig) -> Progress[StateT, EvaluationT]:
     """The progress at the first states of a stage and their evaluation, with the ends (B,) of the stage before."""
     fresh = torch.where(_is_finite(at_state), RUNNING, Status.non_finite.code)
     return Progress(
@@ -116,8 +115,8 @@ def begin(state: StateT, at_state: Any, ended: Tensor, config: SolverConfig) -> 
 
 
 def iterate(
-    problem: StageProblem[StateT],
-    p: Progress[StateT],
+    problem: Iterations[StateT, EvaluationT],
+    p: Progress[StateT, EvaluationT],
     config: SolverConfig,
     limits: Tensor,
     over_relaxation: float = 1.0,
@@ -172,10 +171,10 @@ def iterate(
 
 
 def _move(
-    problem: StageProblem[StateT],
-    p: Progress[StateT],
+    problem: Iterations[StateT, EvaluationT],
+    p: Progress[StateT, EvaluationT],
     candidate: StateT,
-    at_candidate: Any,
+    at_candidate: EvaluationT,
     accepted: Tensor,
     config: SolverConfig,
 ) -> Tensor:

@@ -7,12 +7,13 @@ near the state before. All results are values, which a caller may keep for later
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, Protocol, SupportsIndex, TypeVar, overload
+from typing import Protocol, Self, SupportsIndex, TypeVar, overload
 
 import torch
 from torch import Tensor
 
 from directshape_torch.config import StageConfig
+from directshape_torch.numerics.tables import Chosen
 from directshape_torch.solver.sharing import Sharing
 
 
@@ -24,7 +25,7 @@ class TensorTuple(Protocol):
     @overload
     def __getitem__(self, index: SupportsIndex, /) -> Tensor: ...
     @overload
-    def __getitem__(self, index: slice[Any, Any, Any], /) -> tuple[Tensor, ...]: ...
+    def __getitem__(self, index: slice, /) -> tuple[Tensor, ...]: ...
 
 
 StateT = TypeVar("StateT", bound=TensorTuple)
@@ -46,19 +47,36 @@ class EnergyAt(Protocol):
         ...
 
 
-class StageProblem(Protocol[StateT]):
-    """A `StageProblem` is what the iterations of a stage need of B problems, which become fewer as problems end."""
+SightT = TypeVar("SightT")
+SightT_contra = TypeVar("SightT_contra", contravariant=True)
+EvaluationT = TypeVar("EvaluationT", bound=EnergyAt)
+
+
+class HasCost(Protocol):
+    """`HasCost` are the figures of a state, of which the solver only compares the cost of each problem."""
+
+    @property
+    def cost(self) -> Tensor:  # (B,)
+        ...
+
+
+FiguresT = TypeVar("FiguresT", bound=HasCost)
+FiguresT_co = TypeVar("FiguresT_co", bound=HasCost, covariant=True)
+
+
+class Iterations(Protocol[StateT, EvaluationT]):
+    """The `Iterations` of a stage evaluate B problems, which become fewer as problems end."""
 
     @property
     def sharing(self) -> Sharing:
         """The unknowns that problems share."""
         ...
 
-    def evaluate(self, state: StateT, near: Any) -> Any:
-        """The `EnergyAt` of a state that is near the state of another evaluation."""
+    def evaluate(self, state: StateT, near: EvaluationT) -> EvaluationT:
+        """The evaluation of a state that is near the state of another evaluation."""
         ...
 
-    def choose(self, accepted: Tensor, new: Any, old: Any) -> Any:
+    def choose(self, accepted: Tensor, new: EvaluationT, old: EvaluationT) -> EvaluationT:
         """The new evaluation of problems whose step was accepted (B,) bool, the old evaluation of other problems."""
         ...
 
@@ -66,27 +84,28 @@ class StageProblem(Protocol[StateT]):
         """The state moved by tangent vectors (B, D) within the step limits: the only place where a state changes."""
         ...
 
-    def of_problems(self, keep: Tensor, numbers: Sequence[int], at: Any) -> tuple[StageProblem[StateT], Any]:
-        """The problems where `keep` (B,) holds, and their evaluation.
+    def of(self, problems: Chosen) -> Self:
+        """The iterations of some of the problems."""
+        ...
 
-        `numbers` are the places where `keep` holds, as the host knows them.
-        """
+    def evaluation_of(self, problems: Chosen, at: EvaluationT) -> EvaluationT:
+        """The evaluation of some of the problems."""
         ...
 
 
-class BegunStage(Protocol[StateT]):
-    """A `BegunStage` is a stage of all problems, which fixes everything that must not change while costs compare."""
+class Stage(Protocol[StateT, SightT_contra, EvaluationT, FiguresT_co]):
+    """A `Stage` of all problems has begun: everything is fixed that must not change while costs compare."""
 
-    def start(self, seen: Any) -> tuple[StageProblem[StateT], Any]:
-        """The problem that the iterations work on, and the `EnergyAt` of the state where they begin."""
+    def start(self, sight: SightT_contra) -> tuple[Iterations[StateT, EvaluationT], EvaluationT]:
+        """The iterations, and the evaluation of the state where they begin."""
         ...
 
-    def figures(self, seen: Any) -> Any:
-        """The figures of a state from `look`, of which the solver only compares the `cost` (B,)."""
+    def figures(self, sight: SightT_contra) -> FiguresT_co:
+        """The figures of a state from `look`."""
         ...
 
-    def linearise_differentiably(self, state: StateT) -> Any:
-        """The `EnergyAt` of a state, with an autograd graph to the state and to the problem's own inputs."""
+    def linearise_differentiably(self, state: StateT) -> EvaluationT:
+        """The evaluation of a state, with an autograd graph to the state and to the problem's own inputs."""
         ...
 
     def free_unknowns(self, state: StateT) -> Tensor:
@@ -102,7 +121,7 @@ class BegunStage(Protocol[StateT]):
         ...
 
 
-class Problem(Protocol[StateT]):
+class Problem(Protocol[StateT, SightT, EvaluationT, FiguresT_co]):
     """A `Problem` is a batch of B problems, by themselves or in groups that share unknowns."""
 
     @property
@@ -112,27 +131,22 @@ class Problem(Protocol[StateT]):
 
     def stages(self) -> Sequence[StageConfig]: ...
 
-    def look(self, state: StateT) -> Any:
+    def look(self, state: StateT) -> SightT:
         """The preparation of a state, with which stages and figures begin."""
         ...
 
-    def begin(self, stage: int, seen: Any) -> BegunStage[StateT]:
+    def begin(self, stage: int, sight: SightT) -> Stage[StateT, SightT, EvaluationT, FiguresT_co]:
         """The stage of that number, which begins at a state from `look`; -1 is the last stage."""
         ...
 
-    def of_problems(self, keep: Tensor) -> Problem[StateT]:
-        """The problems where `keep` (B,) holds."""
+    def of(self, problems: Chosen) -> Self:
+        """Some of the problems."""
         ...
 
 
 def remade(state: StateT, tensors: Iterable[Tensor]) -> StateT:
     """A state of the same kind from other tensors."""
     return type(state)(*tensors)
-
-
-def take_rows(state: StateT, index: Tensor) -> StateT:
-    """Rows of every tensor of a state."""
-    return remade(state, (x[index] for x in state))
 
 
 def put_rows(state: StateT, index: Tensor, rows: StateT) -> StateT:

@@ -14,10 +14,11 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from directshape_torch.numerics.tables import Chosen, Table
 from directshape_torch.solver.damped_solve import damped_solution, damped_step, is_finite, newton_step
 
 
-class Sharing:
+class Sharing(Table):
     """A `Sharing` groups B problems, in this class one by one. `members` (B,) bool says which problems count."""
 
     def damped_step(self, hessian: Tensor, gradient: Tensor, damping: Tensor, members: Tensor) -> tuple[Tensor, Tensor]:
@@ -54,8 +55,8 @@ class Sharing:
         """
         return information
 
-    def of_problems(self, numbers: Sequence[int]) -> Sharing:
-        """The sharing of the problems with these numbers."""
+    def of(self, problems: Chosen) -> Sharing:
+        """The sharing of some of the problems."""
         return self
 
 
@@ -79,7 +80,7 @@ class Groups(Sharing):
     column: Tensor  # (B, D) column of each unknown in the system of its group
 
     @classmethod
-    def of(
+    def from_numbers(
         cls,
         group: Sequence[int],
         own: Tensor,
@@ -90,7 +91,7 @@ class Groups(Sharing):
         """The groups of problems with equal numbers in `group`; without `place`, problems keep their order.
 
         Examples:
-            >>> groups = Groups.of([7, 3, 7], own=torch.arange(2), shared=torch.arange(2, 3))
+            >>> groups = Groups.from_numbers([7, 3, 7], own=torch.arange(2), shared=torch.arange(2, 3))
             >>> groups.rows
             tensor([[0, 2],
                     [1, 1]])
@@ -133,9 +134,9 @@ class Groups(Sharing):
         """The members (B,) where all problems count."""
         return torch.ones_like(self.of_problem, dtype=torch.bool)
 
-    def of_problems(self, numbers: Sequence[int]) -> Groups:
-        group, place = ([of_all[number] for number in numbers] for of_all in (self.group, self.place))
-        return Groups.of(group, self.own, self.shared, self.of_next, place)
+    def of(self, problems: Chosen) -> Groups:
+        group, place = ([of_all[number] for number in problems.numbers] for of_all in (self.group, self.place))
+        return Groups.from_numbers(group, self.own, self.shared, self.of_next, place)
 
     def total(self, values: Tensor, members: Tensor) -> Tensor:
         return self._members(values, members).sum(dim=1)[self.of_problem]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
 
-from directshape_torch.numerics.records import Record
+from directshape_torch.numerics.records import Dense
+from directshape_torch.numerics.tables import Table
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.state.unknowns import Unknowns, blocks_of_car
 
@@ -17,10 +17,10 @@ from directshape_torch.state.unknowns import Unknowns, blocks_of_car
 class CarState(NamedTuple):
     """A `CarState` is the `State` of B cars that are each refined alone."""
 
-    T_obj_cam: Tensor  # (B, 4, 4) left camera to object
-    code: Tensor  # (B, K) standard deviations
-    # (B, S) measured minus true disparity, full-resolution pixels; S is 0 where the offset is known, else 1
-    offset_px: Tensor
+    T_obj_cam: Annotated[Tensor, Dense("B", 4, 4)]  # left camera to object
+    code: Annotated[Tensor, Dense("B", "K")]  # standard deviations
+    # measured minus true disparity, full-resolution pixels; S is 0 where the offset is known, else 1
+    offset_px: Annotated[Tensor, Dense("B", "S")]
 
     @classmethod
     def of(cls, T_obj_cam: Tensor, code: Tensor, num_offsets: int = 0) -> CarState:
@@ -42,31 +42,32 @@ class CarState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class CarBatch(Record):
+class CarBatch(Table):
     """A `CarBatch` holds what the terms know of B cars besides their pixels; it is fixed for a whole refinement."""
 
     num_detections: int  # number of detections of the call, including refused ones
-    detection_row: Tensor  # (B,) row of each car among the detections of the call
-    frame_index: Tensor  # (B,) frame of each car
-    input_depth: Tensor  # (B,) metres
-    K_left: Tensor  # (B, 3, 3)
-    K_right: Tensor  # (B, 3, 3)
-    T_right_cam: Tensor  # (B, 4, 4)
-    ground_normal_cam: Tensor  # (B, 3)
-    ground_offset: Tensor  # (B,)
-    detector_hwl: Tensor  # (B, 3)
-    detector_T_cam_obj: Tensor  # (B, 4, 4) input pose
-    detector_pose_sigma: Tensor | None  # (B, 4) standard deviations of the input pose, see `Detections`
-    # (B,) standard deviation of the unknown offset of the disparity; None where no car has an unknown offset
-    offset_sigma_px: Tensor | None
-    # (B,) standard deviation of the rig's disparity field at the car; 0 where the offset is an unknown
-    field_sigma_px: Tensor
-    track_id: Tensor | None  # (B,) see `Detections`
-    time_s: Tensor | None = None  # (B,) time of each car's frame, see `FrameBatch`
-    T_world_cam: Tensor | None = None  # (B, 4, 4) camera pose of each car's frame, see `FrameBatch`
-    # (B, 7) standard deviations of the detector's boxes in `CAR_QUANTITIES`, metres, with which results are combined
-    # with these boxes; None where results are not combined
-    detector_noise: Tensor | None = None
+    detection_row: Annotated[Tensor, Dense("B", kind="index")]  # row of each car among the detections of the call
+    frame_index: Annotated[Tensor, Dense("B", kind="index")]  # frame of each car
+    input_depth: Annotated[Tensor, Dense("B")]  # metres
+    K_left: Annotated[Tensor, Dense("B", 3, 3)]
+    K_right: Annotated[Tensor, Dense("B", 3, 3)]
+    T_right_cam: Annotated[Tensor, Dense("B", 4, 4)]
+    ground_normal_cam: Annotated[Tensor, Dense("B", 3)]
+    ground_offset: Annotated[Tensor, Dense("B")]
+    detector_hwl: Annotated[Tensor, Dense("B", 3)]
+    detector_T_cam_obj: Annotated[Tensor, Dense("B", 4, 4)]  # input pose
+    # standard deviations of the input pose, see `Detections`
+    detector_pose_sigma: Annotated[Tensor | None, Dense("B", 4)]
+    # standard deviation of the unknown offset of the disparity; None where no car has an unknown offset
+    offset_sigma_px: Annotated[Tensor | None, Dense("B")]
+    # standard deviation of the rig's disparity field at the car; 0 where the offset is an unknown
+    field_sigma_px: Annotated[Tensor, Dense("B")]
+    track_id: Annotated[Tensor | None, Dense("B", kind="index")]  # see `Detections`
+    time_s: Annotated[Tensor | None, Dense("B")] = None  # time of each car's frame, see `FrameBatch`
+    T_world_cam: Annotated[Tensor | None, Dense("B", 4, 4)] = None  # camera pose of each frame, see `FrameBatch`
+    # standard deviations of the detector's boxes in `CAR_QUANTITIES`, metres, with which results are combined with
+    # these boxes; None where results are not combined
+    detector_noise: Annotated[Tensor | None, Dense("B", 7)] = None
 
     @classmethod
     def from_scene(cls, frames: FrameBatch, detections: Detections, disparity_sigma_px: float = 0.0) -> CarBatch:
@@ -130,11 +131,3 @@ class CarBatch(Record):
         assert self.offset_sigma_px is not None
         per_px = torch.where(self.offset_sigma_px > 0, 1 / self.focal_baseline, 0.0)
         return offset_px * per_px[:, None]
-
-    def of_cars(self, keep: Tensor, numbers: Sequence[int] | None = None) -> CarBatch:
-        """The batch of the cars where `keep` (B,) is true.
-
-        If the host knows the `numbers` of these cars, it need not wait for the device.
-        """
-        index = keep.nonzero()[:, 0] if numbers is None else torch.nonzero_static(keep, size=len(numbers))[:, 0]
-        return self.rows(index)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 import torch
@@ -13,21 +13,24 @@ from directshape_torch.config import StageConfig
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import check_shape
 from directshape_torch.numerics.gradient_mode import map_tensors
+from directshape_torch.numerics.tables import Chosen, declared, is_table, of
 from directshape_torch.rows import Blocks
 from directshape_torch.shape.field import Field
-from directshape_torch.solver.problem import take_rows
 from directshape_torch.state.unknowns import CODE, OFFSET, POSE, State
-from directshape_torch.terms.term import Linear, Sight, Term, Where, linear_of, part_of
+from directshape_torch.terms.term import AnyTerm, Linear, Sight, Term, WhereT, linear_of, part_of
 
-_OWN = ("names", "blocks", "block_weight", "information", "row_weight", "residual", "norm", "of_cars")
+_OWN = ("names", "blocks", "block_weight", "information", "row_weight", "residual", "norm")
 _DEFAULTS = ("sees", "is_prior", "column", "begin", "moving", "where", "linear")
 # Matrices and gradients may differ by this share of their largest entry: by more than rounding, less than 1 cm causes.
 _ROUNDING = 1e-4
 _BLOCKS = POSE, CODE, OFFSET
-_LEAVING = "hand tensors of the cars to PriorTerm(values=...), or cut them in of_cars(keep, numbers)"
+_DECLARE = (
+    'Annotated[Tensor, Dense("B", 3)] has a row for each car, Dense("M", 3) for each block, Dense(3) is for all cars'
+)
+_LEAVING = "hand tensors of the cars to PriorTerm(values=...), or keep them in fields that declare their axes"
 
 
-def check_members(term: Term) -> None:
+def check_members(term: AnyTerm) -> None:
     """Raise `InputError` unless a term has all members of `Term`, names for its columns and known blocks."""
     missing = [name for name in (*_OWN, *_DEFAULTS) if not _has(term, name)]
     if missing:
@@ -43,7 +46,7 @@ def check_members(term: Term) -> None:
 
 @torch.no_grad()
 def check_term(
-    term: Term, stage: StageConfig, sight: Sight, taken: Collection[str], field_at: Callable[[Tensor], Field]
+    term: AnyTerm, stage: StageConfig, sight: Sight, taken: Collection[str], field_at: Callable[[Tensor], Field]
 ) -> None:
     """Raise `InputError` unless all values of a term at a state have the types and shapes that `Term` requires.
 
@@ -60,6 +63,7 @@ def check_term(
     if len(set(names)) < len(names) or not set(names).isdisjoint(taken):
         raise InputError(f"{called}: names", f"names that no other column has ({', '.join(taken)})", repr(names))
     num_cars = len(sight.state.code)
+    _check_fields(called, term, {"B": num_cars})
     begun = term.begin(stage, sight)
     _check_rows(f"{called} after begin(...)", begun, num_cars)
     _check_linear(f"{called}: linear(...)", begun, begun.where(sight), sight.field, sight.state)
@@ -71,13 +75,15 @@ def check_term(
     # The remaining cars are every other car, the last car, or none; in the first two cases all cars get new numbers.
     for numbers in dict.fromkeys((tuple(range(1, num_cars, 2)), tuple(range(num_cars))[-1:], ())):
         if len(numbers) < num_cars:
-            few = take_rows(sight.state, torch.tensor(numbers, dtype=torch.int64, device=sight.state.code.device))
-            left = f"{called} after of_cars(...)"
-            now = _check_leaving(left, moving, where, few, field_at(few.code), numbers, num_cars)
+            keep = torch.zeros(num_cars, dtype=torch.bool, device=sight.state.code.device)
+            keep[list(numbers)] = True
+            left, few = f"{called} after of(cars)", of(sight.state, Chosen(keep, numbers))
+            with named_errors(left, len(numbers)):
+                now = _products_of(Chosen(keep, numbers), moving, where, few, field_at(few.code))
             check_same(left, now, before, numbers)
 
 
-def car_products(term: Term, field: Field, state: State, where: Where) -> Tensor:
+def car_products(term: Term[WhereT], field: Field, state: State, where: WhereT) -> Tensor:
     """Sums of a term for its cars (B, D + 1, D): the Gauss-Newton matrix, and the gradient as its last row."""
     products = part_of(term, linear_of(term, field, state, where), fisher=False).products
     sums = products.new_zeros(len(state.code), *products.shape[1:])
@@ -96,21 +102,10 @@ def check_same(called: str, now: Tensor, before: Tensor, numbers: Sequence[int])
         raise InputError(called, "the rows that each car had before", f"others of car {car}", _LEAVING)
 
 
-def _check_leaving(
-    called: str, term: Term, where: Where, few: State, field: Field, numbers: Sequence[int], num_cars: int
-) -> Tensor:
-    """Sums of the cars `numbers`, computed and checked as in an iteration after the other cars have left."""
-    keep = torch.zeros(num_cars, dtype=torch.bool, device=few.code.device)
-    keep[list(numbers)] = True
-    with named_errors(called, len(numbers)):
-        part = term.of_cars(keep, numbers)
-    _check_rows(called, part, len(numbers))
-    blocks = term.blocks.of_cars(keep, numbers)[1]
-    looks = (
-        where if isinstance(where, tuple) and not where else map_tensors(lambda x: x.index_select(-2, blocks), where)
-    )
-    _check_linear(f"{called}: linear(...)", part, looks, field, few)
-    return car_products(part, field, few, looks)
+def _products_of(cars: Chosen, term: Term[WhereT], where: WhereT, few: State, field: Field) -> Tensor:
+    """The sums of some cars, computed as in an iteration after the other cars have left."""
+    blocks = term.blocks.kept(cars)
+    return car_products(term.of(cars), field, few, map_tensors(lambda x: x.index_select(-2, blocks), where))
 
 
 @contextmanager
@@ -124,14 +119,29 @@ def named_errors(called: str, num_cars: int, cure: str = _LEAVING) -> Iterator[N
         raise InputError(called, f"values for {num_cars} cars", f"{type(error).__name__}: {error}", cure) from error
 
 
-def _has(term: Term, name: str) -> bool:
+def _has(term: AnyTerm, name: str) -> bool:
     """Whether a term has a member that is more than an empty member inherited from `Term`."""
     # `hasattr` would evaluate properties, and rows may be known only after a stage has begun.
     is_inherited = name in _OWN and inspect.getattr_static(term, name, None) is vars(Term)[name]
     return name in dir(term) and not is_inherited
 
 
-def _check_rows(called: str, term: Term, num_cars: int) -> None:
+def _check_fields(called: str, table: object, sizes: Mapping[int | str, int]) -> None:
+    """Check that all tensors of a table have the axes that its fields declare, by which cars that leave take theirs."""
+    specs = declared(table)
+    names = specs.keys() | getattr(table, "__dict__", {}).keys()
+    parts = dict(enumerate(table)) if type(table) is tuple else {name: getattr(table, name) for name in sorted(names)}
+    for name, part in parts.items():
+        spec = specs.get(str(name))
+        if is_table(part) and spec is None:
+            _check_fields(called, part, sizes)
+        elif isinstance(part, Tensor) and spec is None:
+            raise InputError(f"{called}: {name}", "a declaration of its axes", "none", _DECLARE)
+        elif isinstance(part, Tensor) and spec is not None:
+            check_shape(f"{called}: {name}", part, [sizes.get(size, size) for size in spec.shape], "as declared")
+
+
+def _check_rows(called: str, term: AnyTerm, num_cars: int) -> None:
     """Check that the blocks belong to cars of this batch, and that each block and row has one weight."""
     blocks = term.blocks
     if not isinstance(blocks, Blocks):
@@ -141,19 +151,15 @@ def _check_rows(called: str, term: Term, num_cars: int) -> None:
     if list(blocks.counts) != counts:
         raise InputError(f"{called}: blocks.counts", f"the blocks of each car, {counts}", f"{list(blocks.counts)}")
     num_blocks = len(blocks.owner)
+    _check_fields(called, term, {"B": num_cars, "M": num_blocks})
     _check_numbers(f"{called}: column", term.column, len(term.names), "names")
-    for name, weight in (
-        ("column", term.column),
-        ("block_weight", term.block_weight),
-        ("information", term.information),
-    ):
-        check_shape(f"{called}: {name}", weight, (num_blocks,), "one for each block")
+    check_shape(f"{called}: column", term.column, (num_blocks,), "one for each block")
     for name, weight in (("block_weight", term.block_weight), ("information", term.information)):
+        check_shape(f"{called}: {name}", weight, (num_blocks,), "one for each block")
         if weight.dtype != torch.float64:
             raise InputError(f"{called}: {name}", "float64, for sums", str(weight.dtype), "convert it with .double()")
-    check_shape(
-        f"{called}: row_weight", term.row_weight, (num_blocks, "R", "N"), "one for each block, row and residual"
-    )
+    of_rows = num_blocks, "R", "N"
+    check_shape(f"{called}: row_weight", term.row_weight, of_rows, "one for each block, row and residual")
 
 
 def _check_numbers(called: str, numbers: Tensor, count: int, of_what: str) -> None:
@@ -165,7 +171,7 @@ def _check_numbers(called: str, numbers: Tensor, count: int, of_what: str) -> No
         raise InputError(called, f"numbers of the {count} {of_what}", got, "number the cars of this batch from 0")
 
 
-def _check_linear(called: str, term: Term, where: Where, field: Field, state: State) -> None:
+def _check_linear(called: str, term: Term[WhereT], where: WhereT, field: Field, state: State) -> None:
     """Check that the factors of the Jacobian, the residuals and the norms fit the rows."""
     with named_errors(called, len(state.code)):
         at = term.linear(field, state, where)

@@ -8,13 +8,14 @@ the car's frame and is improved. Both ways end at one point. Depths are constant
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
 
 from directshape_torch.compile import compilable
 from directshape_torch.numerics.gradient_mode import as_constant
+from directshape_torch.numerics.records import Dense
 from directshape_torch.rows import ObjectRays, Rays
 from directshape_torch.shape.field import Field
 
@@ -59,19 +60,20 @@ _FAR_M = 1e4
 class Closest(NamedTuple):
     """`Closest` holds the points where rays (M, R) come closest to their car."""
 
-    points_obj: Tensor  # (3, M, R) metres
-    depth: Tensor  # (M, R) metres
-    crosses: Tensor  # (M, R) bool, whether the ray crosses the prior's bounds; other fields are valid only there
-    face_obj: Tensor  # (3, M, R) see `RayMinimum`
+    points_obj: Annotated[Tensor, Dense(3, "M", "R")]  # metres
+    depth: Annotated[Tensor, Dense("M", "R")]  # metres
+    # whether the ray crosses the prior's bounds; other fields are valid only there
+    crosses: Annotated[Tensor, Dense("M", "R", kind="flags")]
+    face_obj: Annotated[Tensor, Dense(3, "M", "R")]  # see `RayMinimum`
 
 
 class Hits(NamedTuple):
     """`Hits` holds the points where rays (M, R) enter their car."""
 
-    points_obj: Tensor  # (3, M, R) metres, far away where no ray enters
-    normal_obj: Tensor  # (3, M, R) gradient of the signed distance at the points
-    found: Tensor  # (M, R) bool, whether the ray enters
-    depth: Tensor  # (M, R) metres
+    points_obj: Annotated[Tensor, Dense(3, "M", "R")]  # metres, far away where no ray enters
+    normal_obj: Annotated[Tensor, Dense(3, "M", "R")]  # gradient of the signed distance at the points
+    found: Annotated[Tensor, Dense("M", "R", kind="flags")]  # whether the ray enters
+    depth: Annotated[Tensor, Dense("M", "R")]  # metres
 
 
 class March(NamedTuple):
@@ -82,9 +84,14 @@ class March(NamedTuple):
     crosses: Tensor  # (M, R) bool
 
 
-@compilable(sizes={"owner": 0, "centre_cam": 0, "ray_cam": 1, "values": 0, "T_obj_cam": 0})
+@compilable
 def marched_views(
-    left: Rays, right: Rays, bounds_obj: Tensor, num_samples: int, field: Field, T_obj_cam: Tensor
+    left: Rays,
+    right: Rays,
+    bounds_obj: Tensor,
+    num_samples: int,
+    field: Field,
+    T_obj_cam: Annotated[Tensor, Dense("B", 4, 4)],
 ) -> tuple[Closest, Hits]:
     """Closest points of the rays of both images, left first, and hits of the left rays; all are constants."""
     pairs = zip(left, right, (0, 0, 1), strict=True)

@@ -11,9 +11,8 @@ docs/derivations/photometric.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,7 +20,9 @@ from torch import Tensor
 from directshape_torch.config import PhotometricConfig, StageConfig
 from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
-from directshape_torch.numerics.tensors import length
+from directshape_torch.numerics.records import Dense
+from directshape_torch.numerics.tables import Table
+from directshape_torch.numerics.tensors import length, occurrences
 from directshape_torch.rows import BLOCK, Blocks, CarSums, ObjectRays, Rays, Rows
 from directshape_torch.shape.field import Field
 from directshape_torch.state.cars import CarBatch
@@ -55,25 +56,31 @@ class PixelSet(NamedTuple):
 
     rows: PhotometricRows
     blocks: Blocks
-    sight_blocks: Blocks  # blocks of a `Sight` of these cars, in the left image
-    sight_place: Tensor  # (M, 64) place of each pixel in `sight_blocks`
-    filled: Tensor  # (M, 64) bool, whether the place holds a pixel
-    weight: Tensor  # (M,) float64, lambda over the number of neighbours of the car
-    support: Tensor  # (B,) number of pixels of the car, float64
+    sight_blocks: Annotated[Tensor, Dense("B", kind="index")]  # number of blocks of a `Sight` in the left image
+    place_in_car: Annotated[Tensor, Dense("M", BLOCK, kind="index")]  # place of each pixel in these blocks of its car
+    filled: Annotated[Tensor, Dense("M", BLOCK, kind="flags")]  # whether the place holds a pixel
+    weight: Annotated[Tensor, Dense("M")]  # float64, lambda over the number of neighbours of the car
+    support: Annotated[Tensor, Dense("B")]  # number of pixels of the car, float64
+
+    @property
+    def sight_place(self) -> Tensor:
+        """Place (M, 64) of each pixel among the left places of a `Sight` of these cars."""
+        return self.place_in_car + first_places(self.sight_blocks, self.blocks.owner)
 
 
 class Surface(NamedTuple):
     """A `Surface` is where the rows of this term look: the surface under the pixels."""
 
-    points_obj: Tensor  # (3, M, 64) metres, next to the surface
-    normal_obj: Tensor  # (3, M, 64) gradient of the signed distance at `points_obj`
-    depth: Tensor  # (M, 64) depth with which the pixels are warped, metres
-    on_surface: Tensor  # (M, 64) bool, whether the ray meets a surface without grazing it
-    usable: Tensor  # (M, 64) bool, whether the pixel is on the surface and comparable with the right image
+    points_obj: Annotated[Tensor, Dense(3, "M", BLOCK)]  # metres, next to the surface
+    normal_obj: Annotated[Tensor, Dense(3, "M", BLOCK)]  # gradient of the signed distance at `points_obj`
+    depth: Annotated[Tensor, Dense("M", BLOCK)]  # depth with which the pixels are warped, metres
+    on_surface: Annotated[Tensor, Dense("M", BLOCK, kind="flags")]  # whether the ray meets a surface without grazing it
+    # whether the pixel is on the surface and comparable with the right image
+    usable: Annotated[Tensor, Dense("M", BLOCK, kind="flags")]
 
 
 @dataclass(frozen=True)
-class PhotometricEvidence:
+class PhotometricEvidence(Table):
     """This `Evidence` is what the images show of B cars; each stage makes its photometric term of it."""
 
     config: PhotometricConfig  # weight and forms
@@ -93,6 +100,7 @@ class PhotometricEvidence:
         packed = Rows.of_sorted(left.pixels.object_index[chosen], len(self.cars))
         row = chosen[packed.row]
         place = left.packed.places[row]
+        sight_blocks = occurrences(left.packed.blocks.owner, len(self.cars))
         rows = left.rows(self.config, self.cars, packed, row, stage.image_level)
         depth = sight.hits.depth.flatten()[place]
         if not nothing_is_differentiated():
@@ -108,16 +116,13 @@ class PhotometricEvidence:
         total, support = CarSums.of(owner, len(self.cars)).sum(per_block).unbind(dim=1)
         rows = rows._replace(intensity_left=matched, pixel_weight=rows.pixel_weight * counted)
         weight = (self.config.weight / total.clamp_min(1))[owner]
-        fixed = PixelSet(rows, packed.blocks, left.packed.blocks, place, packed.filled, weight, support)
+        place_in_car = place - first_places(sight_blocks, owner)
+        fixed = PixelSet(rows, packed.blocks, sight_blocks, place_in_car, packed.filled, weight, support)
         return Photometric(self.config, self.cars, fixed)
-
-    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> PhotometricEvidence:
-        cars = self.cars.of_cars(keep, numbers)
-        return replace(self, cars=cars, left=self.left.of_cars(keep, len(cars)))
 
 
 @dataclass(frozen=True)
-class Photometric(Term):
+class Photometric(Term[Surface]):
     """A `Photometric` is the term of a stage that has begun; the docstring of the module gives its cost."""
 
     config: PhotometricConfig  # weight and forms
@@ -152,7 +157,7 @@ class Photometric(Term):
         depth, found = (x.flatten()[place] for x in (sight.hits.depth, sight.hits.found))
         return Surface(points, normal, warped_depth(self.cars, depth, sight.state, self.blocks.owner)[0], found, found)
 
-    def linear(self, field: Field, state: State, where: Surface) -> Linear:
+    def linear(self, field: Field, state: State, where: Surface) -> Linear[Surface]:
         rows, owner = self.pixel_set.rows, self.blocks.owner
         surface = near_surface(rows.rays, field, state, where)
         found, J_depth_state = surface.found, surface.J_depth_state
@@ -176,19 +181,10 @@ class Photometric(Term):
     def norm(self, residual: Tensor) -> robust.RobustValue:
         return robust.huber(residual, self.config.huber_grey_levels)
 
-    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Photometric:
-        cars = self.cars.of_cars(keep, numbers)
-        fixed = self.pixel_set
-        blocks, kept = fixed.blocks.of_cars(keep, numbers)
-        place, filled, weight = (x.index_select(0, kept) for x in (fixed.sight_place, fixed.filled, fixed.weight))
-        index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
-        # A later `Sight` has only the blocks of the remaining cars.
-        new_block = torch.cumsum(keep[fixed.sight_blocks.owner].long(), 0) - 1
-        place = new_block[place // BLOCK] * BLOCK + place % BLOCK
-        sight_blocks, _ = fixed.sight_blocks.of_cars(keep, numbers)
-        rows = fixed.rows.take(kept, blocks.owner)
-        of_cars = PixelSet(rows, blocks, sight_blocks, place, filled, weight, fixed.support.index_select(0, index))
-        return Photometric(self.config, cars, of_cars)
+
+def first_places(blocks_of_car: Tensor, owner: Tensor) -> Tensor:
+    """The first place (M, 1) of the cars (M,), where the cars have so many blocks (B,), one car after the other."""
+    return BLOCK * (blocks_of_car.cumsum(0) - blocks_of_car)[owner, None]
 
 
 def warped_depth(cars: CarBatch, depth: Tensor, state: State, owner: Tensor) -> tuple[Tensor, Tensor | None]:

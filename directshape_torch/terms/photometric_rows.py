@@ -6,9 +6,8 @@ cameras, the rig's residual field and the pyramid level, so a comparison at any 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +16,8 @@ from directshape_torch.config import PhotometricConfig
 from directshape_torch.image.grey_levels import GreyPair
 from directshape_torch.image.interpolate import BilinearPatch, bilinear_patch
 from directshape_torch.masks import MASK_THRESHOLD, MaskCrops
+from directshape_torch.numerics.records import Dense
+from directshape_torch.numerics.tables import Table
 from directshape_torch.numerics.tensors import all_along, made_once
 from directshape_torch.rows import OcclusionMap, PixelSamples, Rays, Rows
 from directshape_torch.state.cars import CarBatch
@@ -40,41 +41,26 @@ class PhotometricRows(NamedTuple):
     """`PhotometricRows` are the pixels of a stage in M blocks of 64, each pixel with N neighbours."""
 
     rays: Rays
-    along_ray: Tensor  # (3, N, M, 64) homogeneous right pixel (at the pyramid level) per metre of depth
-    along_baseline: Tensor  # (3, M, 64) homogeneous right pixel (at the pyramid level) at depth zero
-    intensity_left: Tensor  # (N, M, 64) grey levels, brought to the brightness of the right image
-    pixel_weight: Tensor  # (M, 64) weight by the gradient; zero in empty places and outside of the set
-    neighbour_weight: Tensor  # (N, M, 64) zero for neighbours that the mask excludes from the car
+    # homogeneous right pixel (at the pyramid level) per metre of depth, and at depth zero
+    along_ray: Annotated[Tensor, Dense(3, "N", "M", 64)]
+    along_baseline: Annotated[Tensor, Dense(3, "M", 64)]
+    intensity_left: Annotated[Tensor, Dense("N", "M", 64)]  # grey levels, brought to the brightness of the right image
+    pixel_weight: Annotated[Tensor, Dense("M", 64)]  # by the gradient; zero in empty places and outside of the set
+    neighbour_weight: Annotated[Tensor, Dense("N", "M", 64)]  # zero for neighbours that the mask excludes from the car
     right: RightView
-
-    def take(self, kept: Tensor, owner: Tensor) -> PhotometricRows:
-        """The blocks `kept` (Q,), with new car numbers `owner` (Q,)."""
-        return PhotometricRows(
-            self.rays.take(kept, owner),
-            self.along_ray.index_select(2, kept),
-            self.along_baseline.index_select(1, kept),
-            self.intensity_left.index_select(1, kept),
-            self.pixel_weight.index_select(0, kept),
-            self.neighbour_weight.index_select(1, kept),
-            self.right.take(kept),
-        )
 
 
 class RightView(NamedTuple):
     """A `RightView` holds, for each block, the right image of its frame and where nearer instances hide its car."""
 
-    pixels: Tensor  # (A,) grey levels of all frames at the pyramid level, one after another
-    frame: Tensor  # (M, 4) first pixel of the block's frame, pixels per row, last column, last row
-    to_full: Tensor  # (M, 2) full-resolution pixels per level pixel, and full-resolution position of level pixel 0
-    crop: Tensor  # (M, 6) where the car is looked up in an `OcclusionMap`
-    in_front: Tensor  # (M, 2) an instance hides the car if its value in `covering` is below this
-    covering: Tensor  # (C, 2) the foremost instances of the `OcclusionMap`
-
-    def take(self, kept: Tensor) -> RightView:
-        """The view of the blocks `kept` (Q,)."""
-        return self._replace(
-            frame=self.frame[kept], to_full=self.to_full[kept], crop=self.crop[kept], in_front=self.in_front[kept]
-        )
+    pixels: Annotated[Tensor, Dense("A")]  # grey levels of all frames at the pyramid level, one after another
+    # first pixel of the block's frame, pixels per row, last column, last row
+    frame: Annotated[Tensor, Dense("M", 4, kind="index")]
+    # full-resolution pixels per level pixel, and full-resolution position of level pixel 0
+    to_full: Annotated[Tensor, Dense("M", 2)]
+    crop: Annotated[Tensor, Dense("M", 6, kind="index")]  # where the car is looked up in an `OcclusionMap`
+    in_front: Annotated[Tensor, Dense("M", 2)]  # an instance hides the car if its value in `covering` is below this
+    covering: Annotated[Tensor, Dense("A", 2)]  # the foremost instances of the `OcclusionMap`
 
 
 class Comparison(NamedTuple):
@@ -86,34 +72,19 @@ class Comparison(NamedTuple):
 
 
 @dataclass(frozen=True)
-class LeftPixels:
+class LeftPixels(Table):
     """`LeftPixels` holds all packed pixels of the left image and both images; pixel sets are made from it."""
 
     pixels: PixelSamples  # P packed pixels
     packed: Rows  # how the pixels fill the blocks of a `Sight`
-    rays: Rays  # rays of these blocks
     pyramid: tuple[GreyPair, ...]  # both images at every level that a stage asks for
     hidden_right: OcclusionMap | None  # where nearer instances cover the right image; None: nowhere
     mask_left: MaskCrops  # masks of the detections of the call
 
-    @classmethod
-    def of(
-        cls,
-        pixels: PixelSamples,
-        packed: Rows,
-        pyramid: Sequence[GreyPair],
-        hidden_right: OcclusionMap | None,
-        mask_left: MaskCrops,
-    ) -> LeftPixels:
-        """`LeftPixels` of pixels and of how they fill blocks."""
-        rays = Rays.of_rows(packed, pixels.origin_cam, pixels.ray_cam)
-        return cls(pixels, packed, rays, tuple(pyramid), hidden_right, mask_left)
-
-    def of_cars(self, keep: Tensor, num_cars: int) -> LeftPixels:
-        """The pixels of the `num_cars` cars where `keep` (B,) is true."""
-        pixels = self.pixels.of_objects(keep)
-        packed = Rows.of_sorted(pixels.object_index, num_cars)
-        return LeftPixels.of(pixels, packed, self.pyramid, self.hidden_right, self.mask_left)
+    @property
+    def rays(self) -> Rays:
+        """The rays of the blocks of a `Sight`."""
+        return Rays.of_rows(self.packed, self.pixels.origin_cam, self.pixels.ray_cam)
 
     def rows(
         self, config: PhotometricConfig, cars: CarBatch, packed: Rows, row: Tensor, image_level: int

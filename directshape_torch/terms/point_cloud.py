@@ -7,33 +7,34 @@ stereo (the presets "geometric" and "combined") or from a LiDAR. The derivation 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
+from directshape_torch.numerics.records import Dense
 from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.rows import Blocks, PointSamples, Rays, Rows
 from directshape_torch.shape.field import Field
 from directshape_torch.state.unknowns import State
 from directshape_torch.terms import robust
 from directshape_torch.terms.silhouette import sdf_state_jacobian
-from directshape_torch.terms.term import Linear, Term, Where
+from directshape_torch.terms.term import Linear, Nowhere, Term
 
 
 @dataclass(frozen=True)
-class PointCloud(Term):
+class PointCloud(Term[Nowhere]):
     """A `PointCloud` is built with `of_points`; its points stay fixed for the whole refinement."""
 
     name: str  # name of the term
     huber_m: float  # corner of the norm, metres
-    all_blocks: Blocks  # M blocks
+    blocks: Blocks  # M blocks
     points_cam: Rays  # rays from the camera that reach the points at depth 1, (M, 64) places
-    filled: Tensor  # (M, 64) 1 in filled places, else 0
-    weight: Tensor  # (M,) float64, lambda over the number of points of the car
+    filled: Annotated[Tensor, Dense("M", 64)]  # 1 in filled places, else 0
+    block_weight: Annotated[Tensor, Dense("M")]  # float64, lambda over the number of points of the car
 
     @classmethod
     def of_points(cls, config: PointCloudConfig, points: PointSamples, name: str = "point_cloud") -> PointCloud:
@@ -54,40 +55,25 @@ class PointCloud(Term):
         return (self.name,)
 
     @property
-    def blocks(self) -> Blocks:
-        return self.all_blocks
-
-    @property
-    def block_weight(self) -> Tensor:
-        return self.weight
-
-    @property
     def information(self) -> Tensor:
         """The points count one by one, each with the corner of the norm as its standard deviation."""
-        return torch.full_like(self.weight, 1 / self.huber_m**2)
+        return torch.full_like(self.block_weight, 1 / self.huber_m**2)
 
     @property
     def row_weight(self) -> Tensor:
         return self.filled[..., None]
 
-    def linear(self, field: Field, state: State, where: Where) -> Linear:
+    def linear(self, field: Field, state: State, where: Nowhere) -> Linear[Nowhere]:
         points = self._points_obj(state)
         at = field.derivatives(points, self.points_cam.owner, nothing_is_differentiated())
         residual = at.value[..., None]
         return Linear(residual, torch.ones_like(residual), sdf_state_jacobian(points, at.gradient, at), where)
 
-    def residual(self, field: Field, state: State, where: Where) -> Tensor:
+    def residual(self, field: Field, state: State, where: Nowhere) -> Tensor:
         return field.sdf(self._points_obj(state), self.points_cam.owner)[..., None]
 
     def norm(self, residual: Tensor) -> robust.RobustValue:
         return robust.huber(residual, self.huber_m)
-
-    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> PointCloud:
-        blocks, kept = self.all_blocks.of_cars(keep, numbers)
-        points, filled = self.points_cam.take(kept, blocks.owner), self.filled.index_select(0, kept)
-        return replace(
-            self, all_blocks=blocks, points_cam=points, filled=filled, weight=self.weight.index_select(0, kept)
-        )
 
     def _points_obj(self, state: State) -> Tensor:
         rays = self.points_cam.in_objects(state.T_obj_cam)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple, cast
 
 import torch
@@ -26,7 +26,7 @@ from directshape_torch.shape.shape_prior import DimensionsDerivative, ShapePrior
 from directshape_torch.state.cars import CarBatch
 from directshape_torch.state.unknowns import CODE, OFFSET, POSE, State
 from directshape_torch.terms import robust
-from directshape_torch.terms.term import Linear, Term, Where
+from directshape_torch.terms.term import AnyTerm, Linear, Nowhere, Term
 
 RIG_WEIGHT = 0.2
 """The offset of the disparity, in standard deviations, has the weight of the detector's pose."""
@@ -40,7 +40,7 @@ class PriorResidual(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PriorTerm(Term):
+class PriorTerm(Term[Nowhere]):
     """A `PriorTerm` costs `weight * sum_i r_i^2 / 2` for a residual of the state; each car has one block of R rows.
 
     Raises:
@@ -114,21 +114,18 @@ class PriorTerm(Term):
         J, value = torch.func.jacfwd(residual, has_aux=True)(zero)
         return PriorResidual(value, J)
 
-    def linear(self, field: Field, state: State, where: Where) -> Linear:
+    def linear(self, field: Field, state: State, where: Nowhere) -> Linear[Nowhere]:
         at = self._at(state)
         at = self._derived(state) if isinstance(at, Tensor) else at
         residual = at.residual.to(torch.float64)[..., None]
         return Linear(residual, torch.ones_like(residual), at.J_residual_state.to(torch.float64), where)
 
-    def residual(self, field: Field, state: State, where: Where) -> Tensor:
+    def residual(self, field: Field, state: State, where: Nowhere) -> Tensor:
         at = self._at(state)
         return (at if isinstance(at, Tensor) else at.residual).to(torch.float64)[..., None]
 
     def norm(self, residual: Tensor) -> robust.RobustValue:
         return robust.quadratic(residual)
-
-    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> PriorTerm:
-        return replace(self, cars=self.cars.of_cars(keep, numbers))
 
 
 def prior_terms(config: PriorConfig, prior: ShapePrior, cars: CarBatch) -> list[PriorTerm]:
@@ -160,7 +157,7 @@ def prior_terms(config: PriorConfig, prior: ShapePrior, cars: CarBatch) -> list[
     return [term for term in all_terms if term.weight > 0]
 
 
-def with_joined_priors(terms: Sequence[Term]) -> tuple[Term, ...]:
+def with_joined_priors(terms: Sequence[AnyTerm]) -> tuple[AnyTerm, ...]:
     """The library's terms with those that are priors joined into one, because an iteration needs only their sum.
 
     Every prior of the library is a `PriorTerm` of pose and shape. A joined prior needs fewer operations.
@@ -171,7 +168,6 @@ def with_joined_priors(terms: Sequence[Term]) -> tuple[Term, ...]:
 
 
 def _joined(terms: Sequence[PriorTerm]) -> PriorTerm:
-
     def residual_of(cars: CarBatch, state: State) -> PriorResidual:
         unknowns = state.unknowns.only(POSE, CODE)
         scaled = []

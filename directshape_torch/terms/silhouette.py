@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Self
+from typing import Annotated, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -21,6 +21,8 @@ from torch.nn.functional import logsigmoid
 
 from directshape_torch.config import SilhouetteConfig, StageConfig
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
+from directshape_torch.numerics.records import Dense
+from directshape_torch.numerics.tables import Table, take_rows
 from directshape_torch.rows import Blocks, CarSums, PixelSamples, Rays, Rows
 from directshape_torch.shape.field import Field
 from directshape_torch.shape.shape_prior import SdfDerivatives
@@ -35,7 +37,7 @@ from directshape_torch.terms.depth import (
     sample_depths,
     tracked_closest,
 )
-from directshape_torch.terms.term import Linear, Sight, Term, Where
+from directshape_torch.terms.term import Linear, Sight, Term, WhereT
 
 # Zeta stays within these bounds, per metre.
 ZETA_BOUNDS = (4.0, 400.0)
@@ -52,16 +54,16 @@ _MARGIN_EXPONENT_AFTER_WIDER = 10.0
 
 
 @dataclass(frozen=True)
-class MaskRows:
+class MaskRows(Table):
     """`MaskRows` are the rays of both images in blocks, with their masks; both forms of the projection use them."""
 
     blocks: Blocks  # M blocks, first all of the left image, then all of the right one
     rays: Rays  # rays of these blocks
-    side: Tensor  # (M,) 0 for the left image, 1 for the right one
-    foreground: Tensor  # (M, 64) probability of the mask, clamped
-    filled: Tensor  # (M, 64) 1 in filled places, else 0
-    weight: Tensor  # (M,) float64, lambda over the number of rays that the car has in this image
-    left_counts: tuple[int, ...]  # (B,) numbers of blocks of the left image, known to the host
+    side: Annotated[Tensor, Dense("M", kind="index")]  # 0 for the left image, 1 for the right one
+    foreground: Annotated[Tensor, Dense("M", 64)]  # probability of the mask, clamped
+    filled: Annotated[Tensor, Dense("M", 64)]  # 1 in filled places, else 0
+    weight: Annotated[Tensor, Dense("M")]  # float64, lambda over the number of rays that the car has in this image
+    left_counts: Annotated[tuple[int, ...], Dense("B")]  # number of blocks of the left image, known to the host
 
     @classmethod
     def of_pixels(
@@ -86,21 +88,8 @@ class MaskRows:
             sides[0].blocks.counts,
         )
 
-    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> MaskRows:
-        """The rows of the cars where `keep` (B,) is true; the host knows their `numbers`."""
-        return self.kept_of_cars(keep, numbers)[0]
-
-    def kept_of_cars(self, keep: Tensor, numbers: Sequence[int]) -> tuple[MaskRows, Tensor]:
-        """The rows of the cars where `keep` (B,) is true, and the numbers (Q,) of their old blocks."""
-        blocks, kept = self.blocks.of_cars(keep, numbers)
-        of_blocks = (x.index_select(0, kept) for x in (self.side, self.foreground, self.filled, self.weight))
-        side, foreground, filled, weight = of_blocks
-        left_counts = tuple(self.left_counts[number] for number in numbers)
-        rays = self.rays.take(kept, blocks.owner)
-        return MaskRows(blocks, rays, side, foreground, filled, weight, left_counts), kept
-
-    def chosen(self, rays: Tensor) -> tuple[MaskRows, Tensor]:
-        """The rays chosen by a mask (M, 64), in new blocks, and their places (Q, 64) among the old places (M * 64)."""
+    def packed_anew(self, rays: Tensor) -> tuple[MaskRows, Tensor]:
+        """The rays where a mask (M, 64) holds, in new blocks, and their places (Q, 64) among the old (M * 64)."""
         place = rays.flatten().nonzero()[:, 0]
         num_cars = len(self.blocks.counts)
         block = place // rays.shape[1]
@@ -123,11 +112,12 @@ class MaskRows:
             counts[:num_cars],
         ), places
 
+    @property
     def of_sides(self) -> tuple[Rays, Rays]:
         """The rays of the left image, and the rays of the right image."""
-        num_left = sum(self.left_counts)
-        left, right = torch.arange(len(self.side), device=self.side.device).tensor_split([num_left])
-        return self.rays.take(left, self.rays.owner[left]), self.rays.take(right, self.rays.owner[right])
+        blocks = torch.arange(len(self.side), device=self.side.device)
+        left, right = blocks.tensor_split([sum(self.left_counts)])
+        return take_rows(self.rays, left, "M"), take_rows(self.rays, right, "M")
 
     def residual_of_a_miss(self) -> Tensor:
         """Residual `-log p_bg` (M, 64) of rays that stay far from the car."""
@@ -141,34 +131,31 @@ def contour_zeta(cars: CarBatch, stage: StageConfig) -> Tensor:
 
 
 @dataclass(frozen=True)
-class SilhouetteEvidence:
+class SilhouetteEvidence(Table):
     """This `Evidence` is what the masks show of B cars; each stage makes its silhouette term of it."""
 
     config: SilhouetteConfig  # weight and forms
     cars: CarBatch  # B cars
     rows: MaskRows  # their rays
-    bounds_obj: Tensor  # (2, 3) of the prior
+    bounds_obj: Annotated[Tensor, Dense(2, 3)]  # of the prior
 
     names = ("silhouette_left", "silhouette_right")
 
-    def begin(self, stage: StageConfig, sight: Sight) -> Silhouettes:
+    def begin(self, stage: StageConfig, sight: Sight) -> Silhouettes | SilhouetteProducts:
         form = SilhouetteProducts if self.config.form == "product" else Silhouettes
         zeta = contour_zeta(self.cars, stage)[self.rows.rays.owner][:, None]
         return form(self.config, self.cars, self.rows, self.bounds_obj, zeta)
 
-    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> SilhouetteEvidence:
-        return replace(self, cars=self.cars.of_cars(keep, numbers), rows=self.rows.of_cars(keep, numbers))
-
 
 @dataclass(frozen=True)
-class Silhouettes(Term):
-    """`Silhouettes` is the term of both images in a stage, with the projection by closest approach."""
+class OfMasks(Term[WhereT]):
+    """`OfMasks` is what the terms of both forms of the projection have in common, for both images in a stage."""
 
     config: SilhouetteConfig  # weight and forms
     cars: CarBatch  # B cars
     rows: MaskRows  # their rays
-    bounds_obj: Tensor  # (2, 3) of the prior
-    zeta: Tensor  # (M, 1) steepness of the projection, per metre
+    bounds_obj: Annotated[Tensor, Dense(2, 3)]  # of the prior
+    zeta: Annotated[Tensor, Dense("M", 1)]  # steepness of the projection, per metre
 
     names = SilhouetteEvidence.names
 
@@ -192,7 +179,14 @@ class Silhouettes(Term):
     def row_weight(self) -> Tensor:
         return self.rows.filled[..., None]
 
-    def moving(self, sight: Sight, after_wider: bool) -> tuple[Self, Where, Tensor]:
+    def norm(self, residual: Tensor) -> robust.RobustValue:
+        return robust.identity(residual, _RESIDUAL_FLOOR)
+
+
+class Silhouettes(OfMasks[Closest]):
+    """`Silhouettes` is the term of both images in a stage, with the projection by closest approach."""
+
+    def moving(self, sight: Sight, after_wider: bool) -> tuple[Self, Closest, Tensor]:
         """Keep the rays that are or may come near the contour; the other rays stay certain during the next steps."""
         distance = self._least_distance(sight)
         margin = _IN_PLAY_MARGIN_M * self.zeta
@@ -200,7 +194,7 @@ class Silhouettes(Term):
             margin = margin.clamp_max(_MARGIN_EXPONENT_AFTER_WIDER)
         in_play = (distance.abs() * self.zeta < IN_PLAY_EXPONENT + margin) | ~sight.closest.crosses
         resting = torch.where(in_play, torch.zeros_like(distance), self.rows.filled)
-        rows, places = self.rows.chosen(in_play & (self.rows.filled > 0))
+        rows, places = self.rows.packed_anew(in_play & (self.rows.filled > 0))
         cost = (resting * self._of_distance(distance, sight.closest.crosses)[0]).to(torch.float64).sum(dim=1)
         of_side = self.rows.rays.owner + len(self.cars) * self.rows.side
         at_rest = CarSums.of(of_side, 2 * len(self.cars)).sum(cost, self.rows.weight).view(2, -1).T
@@ -208,10 +202,10 @@ class Silhouettes(Term):
         where = Closest(*(x.flatten(-2)[..., places] for x in sight.closest))
         return replace(self, rows=rows, zeta=zeta), where, at_rest
 
-    def where(self, sight: Sight) -> Where:
+    def where(self, sight: Sight) -> Closest:
         return sight.closest
 
-    def linear(self, field: Field, state: State, where: Where) -> Linear:
+    def linear(self, field: Field, state: State, where: Closest) -> Linear[Closest]:
         rays = self.rows.rays.in_objects(state.T_obj_cam)
         now = tracked_closest(field, self.rows.rays, rays, self.bounds_obj, where)
         constant = nothing_is_differentiated()
@@ -222,7 +216,7 @@ class Silhouettes(Term):
         residual, J_residual_sdf = self._of_distance(at.value, now.crosses)
         return Linear(residual[..., None], J_residual_sdf[..., None], sdf_state_jacobian(points, gradient, at), now)
 
-    def residual(self, field: Field, state: State, where: Where) -> Tensor:
+    def residual(self, field: Field, state: State, where: Closest) -> Tensor:
         rays = self.rows.rays.in_objects(state.T_obj_cam)
         points = rays.at(where.depth)
         across = (where.face_obj * rays.direction_obj).sum(0).detach()
@@ -232,13 +226,6 @@ class Silhouettes(Term):
         depth = where.depth - torch.where(is_kink, off_face / torch.where(is_kink, across, 1.0), 0.0)
         sdf = field.sdf(rays.at(depth), self.rows.rays.owner)
         return self._of_distance(sdf, where.crosses)[0][..., None]
-
-    def norm(self, residual: Tensor) -> robust.RobustValue:
-        return robust.identity(residual, _RESIDUAL_FLOOR)
-
-    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Self:
-        (rows, kept), cars = self.rows.kept_of_cars(keep, numbers), self.cars.of_cars(keep, numbers)
-        return replace(self, cars=cars, rows=rows, zeta=self.zeta.index_select(0, kept))
 
     def _least_distance(self, sight: Sight) -> Tensor:
         return sight.field.sdf(sight.closest.points_obj, self.rows.rays.owner)
@@ -294,21 +281,23 @@ def sdf_state_jacobian(
 class Samples(NamedTuple):
     """`Samples` holds the depths at which the rays of a state are sampled."""
 
-    depths: Tensor  # (S, M, 64) metres
-    crosses: Tensor  # (M, 64) bool
+    depths: Annotated[Tensor, Dense("S", "M", 64)]  # metres
+    crosses: Annotated[Tensor, Dense("M", 64, kind="flags")]
 
 
-@dataclass(frozen=True)
-class SilhouetteProducts(Silhouettes):
+class SilhouetteProducts(OfMasks[Samples]):
     """`SilhouetteProducts` is the term of both images with the paper's projection.
 
     It computes in log space, so that rays deep inside or far outside keep all digits. The samples of a ray are at fixed
     shares of its interval with the prior's bounds, and are constants of a linearisation.
     """
 
-    moving, where = Term.moving, Term.where
+    def where(self, sight: Sight) -> Samples:
+        rays = self.rows.rays.in_objects(sight.state.T_obj_cam)
+        depths, crosses = sample_depths(rays, self.bounds_obj, self.config.samples_per_ray)
+        return Samples(depths.detach(), crosses)
 
-    def linear(self, field: Field, state: State, where: Where) -> Linear:
+    def linear(self, field: Field, state: State, where: Samples) -> Linear[Samples]:
         owner = self.rows.rays.owner
         rays = self.rows.rays.in_objects(state.T_obj_cam)
         num_samples, constant = self.config.samples_per_ray, nothing_is_differentiated()
@@ -330,7 +319,7 @@ class SilhouetteProducts(Silhouettes):
         residual = torch.where(crosses, residual, self.rows.residual_of_a_miss())
         return Linear(residual[..., None], torch.ones_like(residual)[..., None], J, Samples(depths.detach(), crosses))
 
-    def residual(self, field: Field, state: State, where: Where) -> Tensor:
+    def residual(self, field: Field, state: State, where: Samples) -> Tensor:
         rays = self.rows.rays.in_objects(state.T_obj_cam)
         sdf = field.sdf(rays.at(where.depths), self.rows.rays.owner)
         residual, _ = product_residual(sdf, self.zeta, self.rows.foreground)

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Sequence
-from typing import Any, NamedTuple, NoReturn, Protocol, Self, TypeAlias
+from typing import Any, Generic, NamedTuple, NoReturn, Protocol, Self, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor
 
-from directshape_torch.compile import compilable, will_compile, with_varying
+from directshape_torch.compile import compilable
 from directshape_torch.config import StageConfig
+from directshape_torch.numerics.tables import Table
 from directshape_torch.rows import Blocks, CarSums
 from directshape_torch.shape.field import Field, field_of
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -23,8 +24,9 @@ from directshape_torch.state.unknowns import CODE, POSE, State
 from directshape_torch.terms.depth import Closest, Hits
 from directshape_torch.terms.robust import RobustValue
 
-Where: TypeAlias = Any
-"""`Where` is where the rows of a term look: a constant tensor (..., M, R), a named tuple of these, or `()`."""
+# Where the rows of a term look is a constant tensor (..., M, R), a named tuple of these, or `Nowhere`.
+WhereT = TypeVar("WhereT", bound=Tensor | tuple[Tensor, ...])
+Nowhere: TypeAlias = tuple[()]
 
 
 class Sight(NamedTuple):
@@ -36,17 +38,17 @@ class Sight(NamedTuple):
     hits: Hits  # hits of the rays of the left image
 
 
-class Linear(NamedTuple):
+class Linear(NamedTuple, Generic[WhereT]):
     """A `Linear` holds residuals of a term, N for each row, with their Jacobian in factors."""
 
     residual: Tensor  # (M, R, N)
     J_residual_inner: Tensor  # (M, R, N)
     # (M, R, S) by the unknowns that the term sees, block after block, or (M, R, D) by all unknowns
     J_inner_state: Tensor
-    where: Where  # the points at which the residuals were taken
+    where: WhereT  # the points at which the residuals were taken
 
 
-class Evidence(Protocol):
+class Evidence(Table, Protocol):
     """`Evidence` is what is known of B cars before the first stage; each stage makes a term of it. It never changes."""
 
     @property
@@ -54,12 +56,8 @@ class Evidence(Protocol):
         """The names of the C columns of costs that the terms of this evidence fill."""
         ...
 
-    def begin(self, stage: StageConfig, sight: Sight) -> Term:
+    def begin(self, stage: StageConfig, sight: Sight) -> AnyTerm:
         """The term of a stage, with fixed pixel sets, counts and widths."""
-        ...
-
-    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Self:
-        """The evidence of the cars where `keep` (B,) is true; the host knows their `numbers`."""
         ...
 
 
@@ -70,7 +68,7 @@ class _FieldAlone:
         raise AttributeError(f"{kind.__name__} object has no value of this field")
 
 
-class Term(Protocol):
+class Term(Table, Protocol[WhereT]):
     """A `Term` is one summand of the energy of B cars in a stage. Terms never change.
 
     A term whose rows are equal in all stages is its own `Evidence`. The defaults suit a measurement with one column of
@@ -125,11 +123,11 @@ class Term(Protocol):
         """Weights (M, R, N) of single residuals; zero in empty places."""
         ...
 
-    def begin(self, stage: StageConfig, sight: Sight) -> Term:
+    def begin(self, stage: StageConfig, sight: Sight) -> AnyTerm:
         """The term of a stage; it is the term itself if the rows are equal in all stages."""
         return self
 
-    def moving(self, sight: Sight, after_wider: bool) -> tuple[Self, Where, Tensor]:
+    def moving(self, sight: Sight, after_wider: bool) -> tuple[Self, WhereT, Tensor]:
         """Return the rows that can change during the iterations of a stage, where they look, and the cost of the rest.
 
         The cost (B, C) of all other rows is in the columns of the term. If `after_wider` is true, an earlier stage had
@@ -138,11 +136,11 @@ class Term(Protocol):
         by_car = len(self.blocks.counts), len(self.names)
         return self, self.where(sight), torch.zeros(by_car, dtype=torch.float64, device=self.blocks.owner.device)
 
-    def where(self, sight: Sight) -> Where:
+    def where(self, sight: Sight) -> WhereT:
         """Where the rows look at the state of a `Sight`, at which every ray was marched."""
-        return ()
+        return ()  # type: ignore[return-value]  # a term that looks somewhere has its own method
 
-    def linear(self, field: Field, state: State, where: Where) -> Linear:
+    def linear(self, field: Field, state: State, where: WhereT) -> Linear[WhereT]:
         """Return residuals with their hand-derived Jacobian; rows look near `where`, which comes from a nearby state.
 
         A user's term may omit this method: `terms.derived` then differentiates its `residual`. With gradients enabled
@@ -150,7 +148,7 @@ class Term(Protocol):
         """
         ...
 
-    def residual(self, field: Field, state: State, where: Where) -> Tensor:
+    def residual(self, field: Field, state: State, where: WhereT) -> Tensor:
         """Differentiable residuals (M, R, N) at a state close to the one whose `linear` gave `where`."""
         ...
 
@@ -158,28 +156,28 @@ class Term(Protocol):
         """The norm of residuals (M, R, N), with its weights."""
         ...
 
-    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Self:
-        """The term of the cars where `keep` (B,) is true; the host knows their `numbers`."""
-        ...
+
+AnyTerm: TypeAlias = Term[Any]
+"""The terms of a sum look at different things."""
 
 
-class Part(NamedTuple):
+class Part(NamedTuple, Generic[WhereT]):
     """A `Part` is what the M blocks of a term add to the sums of their cars, before weighting, float64."""
 
     cost: Tensor  # (M,)
     products: Tensor  # (M, D + 1, D) the Gauss-Newton matrix and, as the last row, the gradient
     information: Tensor  # (M, D, D) the Fisher matrix, or without `fisher` the Gauss-Newton matrix
     residual: Tensor  # (M, R, N)
-    where: Where  # the points at which the residuals were taken
+    where: WhereT  # the points at which the residuals were taken
 
 
-def linear_of(term: Term, field: Field, state: State, where: Where) -> Linear:
+def linear_of(term: Term[WhereT], field: Field, state: State, where: WhereT) -> Linear[WhereT]:
     """`term.linear` with a column for each unknown of the state; columns of unseen unknowns are zero."""
     at = term.linear(field, state, where)
     return at._replace(J_inner_state=state.unknowns.placed(at.J_inner_state, term.sees))
 
 
-def part_of(term: Term, at: Linear, fisher: bool = True) -> Part:
+def part_of(term: Term[WhereT], at: Linear[WhereT], fisher: bool = True) -> Part[WhereT]:
     """Sum over the rows of each block, from residuals and their Jacobian in factors.
 
     Without `fisher` the information is unused, and the Gauss-Newton matrix takes its place.
@@ -198,7 +196,7 @@ def part_of(term: Term, at: Linear, fisher: bool = True) -> Part:
     return Part(_block_costs(weight, norm), products, information, at.residual, at.where)
 
 
-def part_of_rows(term: Term, residual: Tensor, J: Tensor, where: Where) -> Part:
+def part_of_rows(term: Term[WhereT], residual: Tensor, J: Tensor, where: WhereT) -> Part[WhereT]:
     """Sums over the rows of each block, from residuals (M, R, N) and any Jacobian (M, R, N, D) of them."""
     norm, weight = term.norm(residual), term.row_weight
     first, second = (weight * w for w in (norm.gradient_weight, norm.hessian_weight))
@@ -210,43 +208,10 @@ def _block_costs(weight: Tensor, norm: RobustValue) -> Tensor:
     return (weight * norm.rho).sum(dim=-1).to(torch.float64).sum(dim=1)
 
 
-# These axes of the state, of the shapes and of where rows look have sizes that vary from call to call.
-_SIZES = {
-    "T_obj_cam": 0,
-    "code": 0,
-    "offset_px": 0,
-    "path": 0,
-    "T_obj_next": 0,
-    "values": 0,
-    "points_obj": 1,
-    "normal_obj": 1,
-    "face_obj": 1,
-    "depth": 0,
-    "depths": 1,
-    "crosses": 0,
-    "on_surface": 0,
-    "usable": 0,
-}
-
-
-def with_varying_blocks(term: Term) -> Term:
-    """The term, with its number of blocks marked as variable if its code will be compiled."""
-    if not will_compile():
-        return term
-    num_blocks = len(term.blocks.owner)
-
-    def axes_of(tensor: Tensor) -> set[int]:
-        # Tensors in blocks grow along the last axis but one; other tensors, as tables of cars, along the first axis.
-        is_in_blocks = tensor.ndim > 2 and tensor.shape[-2] == num_blocks
-        return {tensor.ndim - 2 if is_in_blocks else 0} if tensor.ndim else set()
-
-    return with_varying(term, axes_of)
-
-
-@compilable(sizes=_SIZES)
+@compilable
 def parts_of(
-    terms: tuple[Term, ...], field: Field, state: State, wheres: tuple[Where, ...], fisher: bool = True
-) -> tuple[Part, ...]:
+    terms: tuple[AnyTerm, ...], field: Field, state: State, wheres: tuple[object, ...], fisher: bool = True
+) -> tuple[Part[Any], ...]:
     """The parts of all terms at a state, with hand-derived Jacobians; rows look near the points `wheres`."""
     ats = [linear_of(term, field, state, where) for term, where in zip(terms, wheres, strict=True)]
     return tuple(part_of(term, at, fisher) for term, at in zip(terms, ats, strict=True))
@@ -271,7 +236,7 @@ class Evaluation(NamedTuple):
     cost: Tensor  # (B,)
     gradient: Tensor  # (B, D)
     hessian: Tensor  # (B, D, D) Gauss-Newton matrix
-    wheres: tuple[Where, ...]  # points at which each term looked
+    wheres: tuple[object, ...]  # points at which each term looked
 
 
 class Figures(NamedTuple):
@@ -281,7 +246,7 @@ class Figures(NamedTuple):
     gradient: Tensor  # (B, T, D)
     hessian: Tensor  # (B, T, D, D)
     information: Tensor  # (B, T, D, D) Fisher matrix, up to one calibration factor
-    parts: tuple[Part, ...]  # part of each term
+    parts: tuple[Part[Any], ...]  # part of each term
 
     @property
     def cost(self) -> Tensor:
@@ -289,7 +254,7 @@ class Figures(NamedTuple):
         return self.term_costs.sum(dim=1)
 
 
-def summed(sums: CarSums, weight: Tensor, parts: Sequence[Part]) -> Evaluation:
+def summed(sums: CarSums, weight: Tensor, parts: Sequence[Part[Any]]) -> Evaluation:
     """The evaluation that sums the blocks of all terms, with weights (M,) of these blocks."""
     products = sums.sum(torch.cat([part.products for part in parts]), weight)
     cost = sums.sum(torch.cat([part.cost for part in parts]), weight)
@@ -297,7 +262,7 @@ def summed(sums: CarSums, weight: Tensor, parts: Sequence[Part]) -> Evaluation:
 
 
 def by_autograd(
-    terms: Sequence[Term], prior: ShapePrior, state: State, wheres: Sequence[Where]
+    terms: Sequence[AnyTerm], prior: ShapePrior, state: State, wheres: Sequence[object]
 ) -> list[tuple[Tensor, Tensor]]:
     """Return residuals (M, R, N) of every term and their Jacobian (M, R, N, D) by forward-mode differentiation.
 

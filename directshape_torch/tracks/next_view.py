@@ -9,10 +9,9 @@ docs/derivations/tracks.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,6 +19,8 @@ from torch import Tensor
 from directshape_torch.config import StageConfig
 from directshape_torch.geometry import se3
 from directshape_torch.image.interpolate import BilinearPatch, bilinear_patch
+from directshape_torch.numerics.records import Dense
+from directshape_torch.numerics.tables import Table
 from directshape_torch.numerics.tensors import constant_like, cross
 from directshape_torch.rows import Blocks, CarSums
 from directshape_torch.shape.field import Field
@@ -50,10 +51,10 @@ _MOST_SHIFT_PX, _CONTRAST_FLOOR = 3, 5.0
 class NextViews(NamedTuple):
     """`NextViews` describes the next view of each of B views."""
 
-    exists: Tensor  # (B,) bool, false for the last view of a track
-    frame_index: Tensor  # (B,)
-    detection_row: Tensor  # (B,)
-    K_left: Tensor  # (B, 3, 3)
+    exists: Annotated[Tensor, Dense("B", kind="flags")]  # false for the last view of a track
+    frame_index: Annotated[Tensor, Dense("B", kind="index")]
+    detection_row: Annotated[Tensor, Dense("B", kind="index")]
+    K_left: Annotated[Tensor, Dense("B", 3, 3)]
 
     @classmethod
     def of(cls, cars: CarBatch, next_view: Tensor) -> NextViews:
@@ -65,11 +66,11 @@ class NextViews(NamedTuple):
 class NextImage(NamedTuple):
     """`NextImage` holds what the pixels of M blocks are compared with in a stage."""
 
-    pixels: Tensor  # (A,) grey levels of all left images at the pyramid level, one after another
-    frame: Tensor  # (M, 4) see `RightView`
-    K: Tensor  # (M, 3, 3) intrinsics of the next camera at the pyramid level
-    grey: Tensor  # (M, 64) grey levels of the pixels, brought to the brightness of the next image
-    weight: Tensor  # (M, 64) weights of the pixels; zero where the next view does not show the pixel
+    pixels: Annotated[Tensor, Dense("A")]  # grey levels of all left images at the pyramid level, one after another
+    frame: Annotated[Tensor, Dense("M", 4, kind="index")]  # see `RightView`
+    K: Annotated[Tensor, Dense("M", 3, 3)]  # intrinsics of the next camera at the pyramid level
+    grey: Annotated[Tensor, Dense("M", 64)]  # grey levels of the pixels, brought to the brightness of the next image
+    weight: Annotated[Tensor, Dense("M", 64)]  # weights of the pixels; zero where the next view does not show the pixel
 
     def at(self, u: Tensor, v: Tensor) -> BilinearPatch:
         """The image at points (M, 64) of the pyramid level."""
@@ -88,7 +89,7 @@ class LookedUp(NamedTuple):
 
 
 @dataclass(frozen=True)
-class NextViewEvidence:
+class NextViewEvidence(Table):
     """This `Evidence` is what the left images show of B views and of the next view of each."""
 
     weight: float  # of the term
@@ -125,14 +126,9 @@ class NextViewEvidence:
         matched = matched_brightness(form, grey[None], right, counted, owner, len(self.next_views.exists))[0]
         return replace(begun, image=everywhere._replace(grey=matched, weight=weight))
 
-    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> NextViewEvidence:
-        index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
-        next_views = NextViews(*(x[index] for x in self.next_views))
-        return NextViewEvidence(self.weight, self.stereo.of_cars(keep, numbers), next_views)
-
 
 @dataclass(frozen=True)
-class NextView(Term):
+class NextView(Term[Surface]):
     """A `NextView` is the term of a stage; the docstring of the module gives its cost."""
 
     weight: float  # of the term
@@ -179,7 +175,7 @@ class NextView(Term):
     def where(self, sight: Sight) -> Surface:
         return self.stereo.where(sight)
 
-    def linear(self, field: Field, state: State, where: Surface) -> Linear:
+    def linear(self, field: Field, state: State, where: Surface) -> Linear[Surface]:
         surface = near_surface(self.stereo.pixel_set.rows.rays, field, state, where)
         points = surface.rays.at(surface.depth)
         at = self.looked_up(state, points)
@@ -230,10 +226,3 @@ class NextView(Term):
             correlation = (total(here * there) + noise) / (contrast_here * contrast_there).sqrt()
             alike = torch.fmax(alike, correlation)
         return alike, count
-
-    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> NextView:
-        index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
-        next_views, stereo = NextViews(*(x[index] for x in self.next_views)), self.stereo.of_cars(keep, numbers)
-        _, kept = self.blocks.of_cars(keep, numbers)
-        image = NextImage(self.image.pixels, *(x.index_select(0, kept) for x in self.image[1:]))
-        return NextView(self.weight, stereo, next_views, image)

@@ -12,8 +12,8 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
+from directshape_torch.refinement.problem import CarMinimum
 from directshape_torch.solver.damped_solve import damped_step
-from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.sharing import said_of_shared
 from directshape_torch.state.cars import CarBatch, CarState
 from directshape_torch.status import is_refined
@@ -55,7 +55,7 @@ class SaidOfShape:
     anything: Tensor  # (B,) bool, whether the view has a quadratic, trusted or not, and can share a shape
 
     @classmethod
-    def at(cls, minimum: Minimum[CarState]) -> SaidOfShape:
+    def at(cls, minimum: CarMinimum[CarState]) -> SaidOfShape:
         """The quadratics of B cars where each ended when refined alone."""
         hessian = minimum.after.hessian.sum(dim=1)
         nothing = torch.zeros_like(hessian[:, 0])

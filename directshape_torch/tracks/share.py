@@ -17,11 +17,12 @@ from torch import Tensor
 
 from directshape_torch.config import StageConfig
 from directshape_torch.errors import InputError
+from directshape_torch.numerics.tables import Chosen, take_rows
 from directshape_torch.refinement.outcome import at_states, going_on, of_views_of_tracks
-from directshape_torch.refinement.problem import CarProblem
+from directshape_torch.refinement.problem import CarProblem, stage_of
 from directshape_torch.refinement.refined import Refined
 from directshape_torch.refinement.result import RefinementResult
-from directshape_torch.solver.problem import put_rows, take_rows
+from directshape_torch.solver.problem import put_rows
 from directshape_torch.solver.sharing import Groups
 from directshape_torch.state.cars import CarBatch, CarState
 from directshape_torch.state.unknowns import CODE
@@ -60,12 +61,12 @@ def brought_together(
     joins = (is_refined(alone.minimum.status) | doubtful) & says.anything
     parts = parts_by_shape(alone.cars, says, joins)
     while (views := Views.of(alone, parts)) is not None:
-        in_track = views.refined(take_rows(initial, views.rows), came.rows(views.rows))
-        leaves = views.leaving(in_track, doubtful[views.rows])
+        in_track = views.refined(take_rows(initial, views.chosen.index), came.rows(views.chosen.index))
+        leaves = views.leaving(in_track, doubtful[views.chosen.index])
         if bool(leaves.any()):
             # The other views start again without the views that leave. This comes before any cut by likeness, because a
             # view in a wrong place falsifies the likeness.
-            joins = joins.index_fill(0, views.rows[leaves], False)
+            joins = joins.index_fill(0, views.chosen.index[leaves], False)
             parts = parts_by_shape(alone.cars, says, joins)
             continue
         finer = cut_once(parts, says, views.unlike_next(in_track))
@@ -79,12 +80,12 @@ def _joined(
     alone: Refined[CarState], views: Views, in_track: Refined[TrackState], initial: CarState
 ) -> RefinementResult:
     """The result of all cars, after the last view has left its track and the last track has been cut."""
-    status, rows = in_track.minimum.status, views.rows
+    status, rows = in_track.minimum.status, views.chosen.index
     chosen = is_refined(status).nonzero()[:, 0]
     ends = is_refined(alone.minimum.status).index_fill(0, rows[chosen], False)
     if alone.problem.config.backward.mode == "unroll" and torch.is_grad_enabled():
         # Only gradients by repeated steps depend on the states from which views began together.
-        ends = ends | views.keep
+        ends = ends | views.chosen.keep
     states = alone.states(initial, ends)
     # The steps of a track depend on all of its views, trusted or not.
     everybody = torch.ones_like(rows, dtype=torch.bool)
@@ -100,8 +101,7 @@ def _joined(
 class Views:
     """`Views` are R views that share a shape with other views."""
 
-    keep: Tensor  # (B,) bool, cars of the call that are these views
-    rows: Tensor  # (R,) numbers of the views among the cars
+    chosen: Chosen  # cars of the call that are these views
     problem: CarProblem  # problem of these views, with the last stage alone
     agreement: Groups  # groups of views that share a code
     cars: CarBatch  # all B cars
@@ -128,18 +128,19 @@ class Views:
         rows = torch.tensor(numbers, device=minimum.status.device)
         keep = torch.zeros_like(minimum.status, dtype=torch.bool).index_fill(0, rows, True)
         ends = take_rows(minimum.end, rows)
-        sharing = Groups.of(group, *own_and_shared(ends), place=place)
-        views = timed(sharing, alone.cars.of_cars(keep))
+        sharing = Groups.from_numbers(group, *own_and_shared(ends), place=place)
+        chosen = Chosen(keep, numbers)
+        views = timed(sharing, alone.cars.of(chosen))
         trusted = is_refined(minimum.status).index_select(0, rows)
         next_view = torch.tensor([numbers.index(row) for row in after], device=keep.device)
-        problem = in_tracks(alone.problem.of_problems(keep), sharing, views, ends, trusted, next_view)
+        problem = in_tracks(alone.problem.of(chosen), sharing, views, ends, trusted, next_view)
         part_number = torch.tensor(of_part, device=keep.device)
         hessian = minimum.after.hessian.sum(dim=1)[rows]
-        return cls(keep, rows, problem, sharing, alone.cars, views, ends, hessian, part_number, next_view)
+        return cls(chosen, problem, sharing, alone.cars, views, ends, hessian, part_number, next_view)
 
     def refined(self, initial: CarState, came: RefinementResult) -> Refined[TrackState]:
         """The views refined together, starting from the shape on which they agree."""
-        cars = self.cars.of_cars(self.keep)
+        cars = self.cars.of(self.chosen)
         return Refined.of(self.problem, cars, self.linked(initial), self.agreed(self.alone), came)
 
     def agreed(self, alone: CarState) -> TrackState:
@@ -173,13 +174,13 @@ class Views:
     def unlike_next(self, in_track: Refined[TrackState]) -> Tensor:
         """Unlikeness (B,) of each car and the next view of its part; 0 for cars outside these views."""
         minimum = in_track.minimum
-        nothing = torch.zeros(len(self.keep), dtype=minimum.after.cost.dtype, device=self.keep.device)
-        term = cast("NextView | None", minimum.stage.term(NEXT_VIEW_NAME))
+        nothing = torch.zeros(len(self.chosen.keep), dtype=minimum.after.cost.dtype, device=self.chosen.keep.device)
+        term = cast("NextView | None", stage_of(minimum).term(NEXT_VIEW_NAME))
         stereo = _photometric(self.problem)
         if term is None or stereo is None:
             return nothing
         unlike = unlikeness(term, is_cut_off(stereo), minimum.seen_end, self.next_view)
-        return nothing.index_copy(0, self.rows, unlike)
+        return nothing.index_copy(0, self.chosen.index, unlike)
 
     def part_of(self, status: Tensor) -> Tensor:
         """Part (R,) of the track of each view; -1 where no other view of the part was refined to share its shape."""
@@ -239,5 +240,5 @@ def in_tracks(
         config=config,
         evidence=(*problem.evidence, *added),
         factors=torch.cat([factors[:, :before], *(x[:, None] for x in columns), factors[:, before:]], dim=1),
-        sharing=Groups.of(sharing.group, sharing.own, shared, of_next, sharing.place),
+        sharing=Groups.from_numbers(sharing.group, sharing.own, shared, of_next, sharing.place),
     )

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from torch import Tensor
 
+from directshape_torch.numerics.records import Dense
 from directshape_torch.state.cars import CarState
 from directshape_torch.state.unknowns import CODE, OFFSET, POSE, Block, State, Unknowns, blocks_of_car
 
@@ -15,12 +16,13 @@ PATH, NEXT_POSE = "path", "next_pose"
 class TrackState(NamedTuple):
     """A `TrackState` is the `State` of B views of tracks."""
 
-    T_obj_cam: Tensor  # (B, 4, 4) left camera to object
-    code: Tensor  # (B, K) standard deviations
-    offset_px: Tensor  # (B, S) see `CarState`
-    path: Tensor  # (B, N) path of the track on the ground, see `tracks.path`; N is 9, or 0 without a path
-    # (B, M, 4, 4) camera of the next view to object, see `tracks.next_view`; M is 1, or 0 without the next-view term
-    T_obj_next: Tensor
+    T_obj_cam: Annotated[Tensor, Dense("B", 4, 4)]  # left camera to object
+    code: Annotated[Tensor, Dense("B", "K")]  # standard deviations
+    offset_px: Annotated[Tensor, Dense("B", "S")]  # see `CarState`
+    # path of the track on the ground, see `tracks.path`; N is 9, or 0 without a path
+    path: Annotated[Tensor, Dense("B", "N")]
+    # camera of the next view to object, see `tracks.next_view`; V is 1, or 0 without the next-view term
+    T_obj_next: Annotated[Tensor, Dense("B", "V", 4, 4)]
 
     @classmethod
     def of(cls, state: State) -> TrackState:

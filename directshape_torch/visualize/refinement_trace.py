@@ -11,13 +11,14 @@ from directshape_torch.compile import compiling
 from directshape_torch.config import RefinerConfig
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
+from directshape_torch.numerics.tables import Chosen, take_rows
 from directshape_torch.observation.packing import Observation, pack_pixels
-from directshape_torch.refinement.problem import CarStage
+from directshape_torch.refinement.problem import CarMinimum, CarStage, stage_of
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.solver.gauss_newton import Minimum, minimise
-from directshape_torch.solver.problem import put_rows, take_rows, where_rows
+from directshape_torch.solver.gauss_newton import minimise
+from directshape_torch.solver.problem import put_rows, where_rows
 from directshape_torch.state.cars import CarState
 from directshape_torch.status import Status
 from directshape_torch.visualize.residuals import CarResiduals, car_residuals
@@ -93,15 +94,15 @@ def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections
         InputError: frames, detections and prior do not fit together.
     """
     result = refiner(frames, detections)
-    took_part = result.cost_before.isfinite().all(dim=1)
-    rows = took_part.nonzero()[:, 0]
+    took_part = Chosen.where(result.cost_before.isfinite().all(dim=1))
+    rows = took_part.index
     everyone, inputs = refiner.problem(frames, detections)
-    problem, initial = everyone.of_problems(took_part), take_rows(inputs, rows)
+    problem, initial = everyone.of(took_part), take_rows(inputs, rows)
     with full_precision(), compiling(refiner.config.compile):
-        minimum: Minimum[CarState] = minimise(problem, initial, refiner.config.solver, record=True)
+        minimum: CarMinimum[CarState] = minimise(problem, initial, refiner.config.solver, record=True)
         states = [initial, *_ends(minimum)]
         costs = torch.stack([minimum.stage.figures(problem.look(state)).term_costs for state in states])
-    none = torch.zeros_like(took_part)
+    none = torch.zeros_like(took_part.keep)
     accepted = [none.index_copy(0, rows, iteration.accepted) for iteration in minimum.trajectory]
     return RefinementTrace(
         result,
@@ -110,12 +111,12 @@ def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections
         torch.stack([none, *accepted]),
         costs.new_full((len(costs), len(detections), costs.shape[2]), torch.nan).index_copy(1, rows, costs),
         rows,
-        minimum.stage,
-        pack_pixels(frames, detections, refiner.config.sampling).of_objects(took_part),
+        stage_of(minimum),
+        pack_pixels(frames, detections, refiner.config.sampling).of(took_part),
     )
 
 
-def _ends(minimum: Minimum[CarState]) -> list[CarState]:
+def _ends(minimum: CarMinimum[CarState]) -> list[CarState]:
     """The states after each iteration: where the next iteration of the stage began, or where the stage ended."""
     stage_ends = (*minimum.stage_starts[1:], minimum.end)
     took_part = minimum.cost_history.isfinite()

@@ -16,12 +16,12 @@ from directshape_torch.config import RefinerConfig
 from directshape_torch.geometry import se3
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.numerics.full_precision import full_precision
+from directshape_torch.numerics.tables import Chosen, take_rows
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rows import PixelSamples, Rows
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.solver.problem import take_rows
 from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.term import Part, Sight
 from directshape_torch.visualize.drawing import Array, View, blue_white_red
@@ -93,7 +93,7 @@ def _of_car(pixels: _Pixels, car: int) -> PixelResiduals:
     return PixelResiduals(uv.astype(np.float64), value.astype(np.float64), lost)
 
 
-def _of_photometry(term: Photometric, at: Part, left: PixelSamples) -> _Pixels:
+def _of_photometry(term: Photometric, at: Part[Surface], left: PixelSamples) -> _Pixels:
     fixed = term.pixel_set
     counted = fixed.rows.pixel_weight > 0
     weight = fixed.rows.neighbour_weight.movedim(0, -1)
@@ -101,7 +101,7 @@ def _of_photometry(term: Photometric, at: Part, left: PixelSamples) -> _Pixels:
     # A `Sight` has the left pixels in their packed blocks.
     pixel = Rows.of_sorted(left.object_index, len(term.cars)).row.flatten()[fixed.sight_place]
     car = fixed.blocks.owner[:, None].expand_as(counted)
-    return car[counted], left.uv[pixel[counted]], mean[counted], ~Surface(*at.where).usable[counted]
+    return car[counted], left.uv[pixel[counted]], mean[counted], ~at.where.usable[counted]
 
 
 @torch.no_grad()
@@ -127,11 +127,12 @@ def residual_maps(
         sampling=sampling,
     )
     frame, detections = loaded.frame, loaded.detections
-    chosen, found = torch.zeros(len(detections), dtype=torch.bool).index_fill(0, rows, True), []
+    found: list[list[CarResiduals]] = []
+    chosen = Chosen.where(torch.zeros(len(detections), dtype=torch.bool).index_fill(0, rows, True))
     with full_precision():
         of_all, inputs = DirectShapeRefiner(prior, config).problem(frame, detections)
-        problem, start = of_all.of_problems(chosen), take_rows(inputs, rows)
-        pixels = pack_pixels(frame, detections, sampling).of_objects(chosen)
+        problem, start = of_all.of(chosen), take_rows(inputs, rows)
+        pixels = pack_pixels(frame, detections, sampling).of(chosen)
         for state in states:
             T_cam_obj, code = (torch.from_numpy(np.asarray(x)).to(start.code) for x in state)
             sight = problem.look(start._replace(T_obj_cam=se3.inverse(T_cam_obj), code=code))

@@ -48,7 +48,7 @@ PARTS: dict[str, tuple[Any, ...]] = {
     "priors": (PriorTerm.linear,),
     "sums over pixels and cars": (term.part_of, term.summed),
     "solve and step": (damped_step, Unknowns.retract),
-    "iterations, the rest": (iterate, CarIterations.choose, CarIterations.of_problems),
+    "iterations, the rest": (iterate, CarIterations.choose, CarIterations.of, CarIterations.evaluation_of),
     "figures at the end": (CarStage.figures,),
     _OUTCOME: (outcome_of,),
 }

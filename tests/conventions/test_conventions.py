@@ -337,7 +337,8 @@ def test_25_letters() -> None:
     P = len(left_of(stage).pixels)
     H, W = scene.frames.images_left.shape[2:]
     assert left_of(stage).pixels.uv.shape == (P, 2)
-    owner, rays = stage.problem.rays[0].owner, stage.problem.rays[0].in_objects(state.T_obj_cam)
+    left, _ = stage.problem.masks.of_sides
+    owner, rays = left.owner, left.in_objects(state.T_obj_cam)
     assert march(sight.field, owner, rays, prior.bounds_obj, S).sdf.shape == (S, len(owner), 64)
     assert len(term.pixel_set.rows.intensity_left) == N == 8
     _, at = stage.start(sight)

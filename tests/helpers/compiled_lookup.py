@@ -7,7 +7,7 @@ import shutil
 import sys
 import types
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import pytest
 import torch
@@ -16,6 +16,7 @@ from torch._dynamo.utils import counters
 
 from directshape_torch import compile as compile_module
 from directshape_torch.compile import Compilable, compilable
+from directshape_torch.numerics.records import Dense
 
 # Asked of the machine and not of `compiler_problem`: where that is wrong, tests must fail and not be skipped.
 COMPILER = shutil.which(os.environ.get("CXX", "clang++" if sys.platform == "darwin" else "g++"))
@@ -25,14 +26,16 @@ needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler on
 class Tables(NamedTuple):
     """A `Tables` has the values of the lookup."""
 
-    grid: Tensor  # (B, 4, 4)
+    grid: Annotated[Tensor, Dense("B", 4, 4)]
     scale: float
 
 
 Nearest = Compilable[[Tensor, Tables, Tensor], tuple[Tensor, Tensor]]
 
 
-def nearest_values(points: Tensor, tables: Tables, car: Tensor) -> tuple[Tensor, Tensor]:
+def nearest_values(
+    points: Annotated[Tensor, Dense("A", 2)], tables: Tables, car: Annotated[Tensor, Dense("A")]
+) -> tuple[Tensor, Tensor]:
     """The plain function."""
     node = torch.fmin((points * 4).clamp_min(0).floor(), torch.tensor(3.0)).long()
     value = tables.scale * tables.grid[car, node[:, 0], node[:, 1]] + points.sum(-1)
@@ -47,16 +50,17 @@ def nearest_inputs(num_points: int, num_cars: int) -> tuple[Tensor, Tables, Tens
     return torch.rand(num_points, 2, generator=generator), Tables(grid, 0.5), car
 
 
-def new_compilable(function: Callable[..., Any], sizes: dict[str, int]) -> Compilable[..., Any]:
+def new_compilable(function: Callable[..., Any]) -> Compilable[..., Any]:
     """A new function to be compiled; each test needs its own, because compiled code belongs to the code object."""
-    code = function.__code__.replace()
-    return compilable(sizes)(types.FunctionType(code, function.__globals__, function.__name__))
+    copy = types.FunctionType(function.__code__.replace(), function.__globals__, function.__name__)
+    copy.__annotations__ = function.__annotations__
+    return compilable(copy)
 
 
 @pytest.fixture
 def nearest() -> Nearest:
     """The function to be compiled, in its plain form."""
-    return new_compilable(nearest_values, {"points": 0, "grid": 0, "car": 0})
+    return new_compilable(nearest_values)
 
 
 def trace_only(monkeypatch: pytest.MonkeyPatch, backend: Callable[..., Any] | str = "aot_eager") -> None:

@@ -3,29 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Self
+from typing import Annotated, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
 from directshape_torch.config import StageConfig
-from directshape_torch.solver.problem import take_rows, where_rows
+from directshape_torch.numerics.records import Dense
+from directshape_torch.numerics.tables import Chosen, take_rows
+from directshape_torch.solver.problem import where_rows
 from directshape_torch.solver.sharing import INDEPENDENT, Sharing
 
 
 class Vector(NamedTuple):
     """A `Vector` is the state of B problems, one point for each."""
 
-    x: Tensor  # (B, D)
+    x: Annotated[Tensor, Dense("B", "D")]
 
 
 class Energy(NamedTuple):
     """An `Energy` has cost, gradient and Gauss-Newton matrix of B problems, and the evaluated points."""
 
-    cost: Tensor  # (B,)
-    gradient: Tensor  # (B, D)
-    hessian: Tensor  # (B, D, D)
-    x: Tensor  # (B, D)
+    cost: Annotated[Tensor, Dense("B")]
+    gradient: Annotated[Tensor, Dense("B", "D")]
+    hessian: Annotated[Tensor, Dense("B", "D", "D")]
+    x: Annotated[Tensor, Dense("B", "D")]
 
 
 class VectorProblem:
@@ -43,8 +45,8 @@ class VectorProblem:
         """The energy at points (B, D)."""
         raise NotImplementedError
 
-    def part(self, index: Tensor) -> Self:
-        """The problems of the given rows (Q,)."""
+    def of(self, problems: Chosen) -> Self:
+        """The problems that are chosen."""
         raise NotImplementedError
 
     def stages(self) -> list[StageConfig]:
@@ -75,9 +77,8 @@ class VectorProblem:
     def step_limits(self) -> Tensor:
         return torch.full((self.num_unknowns,), self.limit, dtype=torch.float64)
 
-    def of_problems(self, keep: Tensor, numbers: Sequence[int], at: Energy) -> tuple[Self, Energy]:
-        index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
-        return self.part(index), take_rows(at, index)
+    def evaluation_of(self, problems: Chosen, at: Energy) -> Energy:
+        return take_rows(at, problems.index)
 
 
 class ResidualProblem(VectorProblem):
@@ -118,11 +119,11 @@ class ResidualProblem(VectorProblem):
             self.near.append(near.x)
         return super().evaluate(state, near)
 
-    def part(self, index: Tensor) -> Self:
-        self.compactions.append(len(index))
+    def of(self, problems: Chosen) -> Self:
+        self.compactions.append(len(problems.numbers))
         part = type(self).__new__(type(self))
-        sharing = self.sharing.of_problems(index.tolist())
-        part.__dict__ = {**self.__dict__, "identity": self.identity[index], "sharing": sharing}
+        identity, sharing = self.identity[problems.index], self.sharing.of(problems)
+        part.__dict__ = {**self.__dict__, "identity": identity, "sharing": sharing}
         return part
 
 

@@ -49,7 +49,7 @@ def test_pixels_of_a_regime(bench_of: BenchOf, prior: PCAShapePrior) -> None:
     assert (exponent < 3).all()
 
     at = bench_of("grazing")
-    num_left = len(at.problem.rays[0].owner)
+    num_left = len(at.problem.masks.of_sides[0].owner)
     left = at.problem.masks.filled[:num_left] > 0
     direction = at.problem.masks.rays.in_objects(at.state.T_obj_cam).direction_obj[:, :num_left]
     cosine = torch.cosine_similarity(at.sight.hits.normal_obj, direction, dim=0)[left]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from helpers.quadratics import Energy, Vector, VectorProblem
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig, StageConfig
+from directshape_torch.numerics.tables import Chosen
 from directshape_torch.solver.differentiate import NotStationaryWarning, implicit_state, unrolled_state
 from directshape_torch.solver.gauss_newton import Minimum, minimise
 
@@ -73,21 +75,24 @@ class Curved(VectorProblem):
     def free_unknowns(self, state: Vector) -> Tensor:
         return state.x.abs() < self.bound
 
-    def part(self, index: Tensor) -> Curved:
-        part = Curved(self.theta[index], self.stage_configs, self.bound)
+    def of(self, problems: Chosen) -> Curved:
+        part = Curved(self.theta[problems.index], self.stage_configs, self.bound)
         part.scale = self.scale
         return part
+
+
+VectorMinimum: TypeAlias = Minimum[Vector, Vector, Energy, Energy]
 
 
 def _theta() -> Tensor:
     return torch.tensor([[0.3, 0.5, 1.2], [-0.4, 0.9, 0.8], [0.1, -0.6, 1.5]], dtype=torch.float64)
 
 
-def _minimum(problem: Curved, start: Tensor, config: SolverConfig = EXACT) -> Minimum[Vector]:
+def _minimum(problem: Curved, start: Tensor, config: SolverConfig = EXACT) -> VectorMinimum:
     return minimise(problem, Vector(start.detach()), config, record=True)
 
 
-def _polished(problem: Curved, minimum: Minimum[Vector]) -> Minimum[Vector]:
+def _polished(problem: Curved, minimum: VectorMinimum) -> VectorMinimum:
     """The minimum after further Newton steps, as differences of minima need more digits than costs decide."""
     state = minimum.state
     for _ in range(60):

@@ -14,6 +14,7 @@ from torch import Tensor
 from directshape_torch.config import SolverConfig, StageConfig
 from directshape_torch.errors import ConfigError
 from directshape_torch.io.config_files import load_config
+from directshape_torch.numerics.tables import Chosen
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.gauss_newton import minimise
 
@@ -35,8 +36,8 @@ class GeometricMedians(VectorProblem):
         gradient = (offset / distance[..., None]).sum(1)
         return Energy(distance.sum(1), gradient, (1 / distance).sum(1)[:, None, None] * torch.eye(2), x)
 
-    def part(self, index: Tensor) -> GeometricMedians:
-        return GeometricMedians(self.points[index], self.stage_configs)
+    def of(self, problems: Chosen) -> GeometricMedians:
+        return GeometricMedians(self.points[problems.index], self.stage_configs)
 
 
 def zeros(count: int, unknowns: int) -> Vector:

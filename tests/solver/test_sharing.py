@@ -10,6 +10,7 @@ from helpers.quadratics import ResidualProblem, Vector
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig, StageConfig
+from directshape_torch.numerics.tables import Chosen
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.gauss_newton import minimise
 from directshape_torch.solver.sharing import INDEPENDENT, Groups
@@ -24,7 +25,7 @@ EVERYBODY = torch.ones(len(GROUP), dtype=torch.bool)
 
 
 def groups(group: tuple[int, ...] = GROUP) -> Groups:
-    return Groups.of(group, torch.tensor(OWN), torch.arange(FIRST, END))
+    return Groups.from_numbers(group, torch.tensor(OWN), torch.arange(FIRST, END))
 
 
 def systems() -> tuple[Tensor, Tensor]:
@@ -98,9 +99,10 @@ CHAIN, PLACE = (1, 8, 1, 8, 3, 1), (1, 0, 0, 1, 0, 2)
 def chain(numbers: list[int]) -> tuple[Groups, dict[int, list[int]]]:
     """Positions of the problems' unknowns and of group 1's: three own ones for each, then two shared ones."""
     own, shared, of_next = torch.arange(3), torch.arange(3, 5), torch.tensor([5])
-    whole = Groups.of(CHAIN, own, shared, of_next, PLACE)
+    whole = Groups.from_numbers(CHAIN, own, shared, of_next, PLACE)
     at = {2: [0, 1, 2, 9, 10, 3], 0: [3, 4, 5, 9, 10, 6], 5: [6, 7, 8, 9, 10, 11]}
-    return whole.of_problems(numbers), at
+    keep = torch.tensor([number in numbers for number in range(len(CHAIN))])
+    return whole.of(Chosen(keep, numbers)), at
 
 
 @pytest.mark.parametrize("left", [None, 0, 5])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from typing import Annotated, Any
 
 import pytest
 import torch
@@ -17,6 +17,7 @@ from torch import Tensor
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
+from directshape_torch.numerics.records import Dense
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
@@ -184,7 +185,7 @@ LEAVING = r"hand tensors of the cars to PriorTerm\(values=...\)"
 def test_a_residual_that_mistakes_the_cars_is_named_before_the_first_step(case: str, detections: Sequence[int]) -> None:
     prior, scene = cached_street()
     refiner = DirectShapeRefiner(prior, DEFAULT, [closed_over(CLOSED[case])])
-    with pytest.raises(InputError, match=rf"^extra term 'radar' after of_cars.*{LEAVING}"):
+    with pytest.raises(InputError, match=rf"^extra term 'radar' after of.*{LEAVING}"):
         refiner.problem(scene.frames, boxes(*detections))
 
 
@@ -215,22 +216,37 @@ def test_rows_found_by_the_numbers_of_the_detections_are_right() -> None:
 
 @dataclass(frozen=True)
 class Keeping(PriorTerm):
-    """A `Keeping` is a term with its own table of the cars, which is cut wrongly when cars leave."""
+    """A `Keeping` is a term with its own table, which goes with the cars because its field declares so."""
 
-    table: Tensor | None = None
-
-    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Keeping:
-        assert self.table is not None
-        return replace(self, cars=self.cars.of_cars(keep, numbers), table=self.table[: len(numbers)])
+    table: Annotated[Tensor | None, Dense("B", 3)] = None
 
     def _at(self, state: CarState) -> PriorResidual:
         assert self.table is not None
         return to_radar(self.cars, state, self.table)
 
 
-def test_a_table_cut_in_the_wrong_place_is_named() -> None:
-    message = r"after of_cars\(...\): expected the rows that each car had before, got others of car 1; hand"
+@dataclass(frozen=True)
+class Undeclared(Keeping):
+    """A term that does not say whether its table belongs to the cars."""
+
+    table: Tensor | None = None
+
+
+def keeping(kind: type[Keeping], change: Callable[[Tensor], Tensor] = lambda x: x) -> TermFactory:
+    return lambda *scene: kind("radar", WEIGHT, scene[2], to_radar, 3, table=change(measured(scene[1])))
+
+
+def test_a_declared_table_goes_with_its_cars() -> None:
+    kept = refine(keeping(Keeping), detections=boxes())
+    torch.testing.assert_close(kept.T_cam_obj, together().T_cam_obj, rtol=0, atol=1e-12)
+
+
+def test_a_table_without_declaration_is_named() -> None:
+    message = r"^extra term 'radar': table: expected a declaration of its axes, got none; .*Dense\(\"B\""
     with pytest.raises(InputError, match=message):
-        refine(
-            lambda *scene: Keeping("radar", WEIGHT, scene[2], to_radar, 3, table=measured(scene[1])), detections=boxes()
-        )
+        refine(keeping(Undeclared), detections=boxes())
+
+
+def test_a_table_of_other_rows_than_declared_is_named() -> None:
+    with pytest.raises(InputError, match=r"^extra term 'radar': table: expected shape \(6, 3\), got \(5, 3\)"):
+        refine(keeping(Keeping, lambda x: x[1:]), detections=boxes())

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.geometry import se3
+from directshape_torch.numerics.tables import Chosen
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
@@ -229,8 +230,9 @@ def test_cars_keep_their_rows_when_others_leave() -> None:
     problem, state = at_truth(*drive())
     term, sight = begun(problem, state)
     keep = torch.tensor([False, True, False, True, True, False])
-    numbers = keep.nonzero()[:, 0].tolist()
-    fewer = term.of_cars(keep, numbers)
+    cars = Chosen.where(keep)
+    numbers = list(cars.numbers)
+    fewer = term.of(cars)
     blocks = keep[term.blocks.owner]
     there = TrackState(*(x[numbers] for x in state))
     where = type(term.where(sight))(*(x[..., blocks, :] for x in term.where(sight)))
@@ -239,6 +241,6 @@ def test_cars_keep_their_rows_when_others_leave() -> None:
     of_fewer = fewer.linear(field_of(problem.prior.bind(there.code)), there, where).residual
     torch.testing.assert_close(of_fewer, residual, rtol=1e-9, atol=1e-9)
     # Before a stage begins too.
-    whole = problem.evidence[0].of_cars(keep, numbers)
+    whole = problem.evidence[0].of(cars)
     assert isinstance(whole, NextViewEvidence)
     assert whole.next_views.detection_row.tolist() == NEXT[numbers].tolist()

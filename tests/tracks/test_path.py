@@ -17,10 +17,10 @@ from torch import Tensor
 from directshape_torch.config import TracksConfig
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
+from directshape_torch.numerics.tables import take_rows
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.solver.problem import take_rows
 from directshape_torch.solver.sharing import Groups
 from directshape_torch.state.cars import CarBatch, CarState
 from directshape_torch.tracks.path import hold_of_path, motion_terms, timed, with_path
@@ -61,7 +61,7 @@ def test_a_car_may_turn_back() -> None:
     mixed = torch.tensor([3, 0, 4, 1, 2])
     turning = torch.tensor([1.0, 2.0, 0.3, 9.0, -3.0, 0.0, 0.4, 2.0, 0.0], dtype=torch.float64)
     cars, state = replace(cars, time_s=TIMES[mixed]), take_rows(on_a_path(turning, None), mixed)
-    sharing = Groups.of([7] * 5, torch.arange(6), torch.arange(6, 9))
+    sharing = Groups.from_numbers([7] * 5, torch.arange(6), torch.arange(6, 9))
     cars = timed(sharing, cars)
     path = with_path(CONFIG, sharing, cars, state).path
     modulo = (path[:, 6] - turning[6] + math.pi / 2) % math.pi - math.pi / 2
@@ -82,7 +82,7 @@ def test_the_path_of_cars_on_a_path_is_found_and_costs_nothing(with_camera: bool
     if backwards:
         half_turn = se3.exp(torch.tensor([0, 0, 0, 0, math.pi, 0], dtype=torch.float64))
         state.T_obj_cam[2] = half_turn @ state.T_obj_cam[2]
-    sharing = Groups.of([4] * 5, own=torch.arange(6), shared=torch.arange(6, 9))
+    sharing = Groups.from_numbers([4] * 5, own=torch.arange(6), shared=torch.arange(6, 9))
     of_track = timed(sharing, cars)
     found = with_path(CONFIG, sharing, of_track, state)
     torch.testing.assert_close(found.path, path.expand(5, 9), rtol=0, atol=1e-8)
@@ -92,7 +92,7 @@ def test_the_path_of_cars_on_a_path_is_found_and_costs_nothing(with_camera: bool
 
 def test_the_fitted_path_is_the_cheapest_for_views_where_they_are() -> None:
     cars, state = views(with_camera=False)
-    sharing = Groups.of([1, 2, 1, 1, 2], own=torch.arange(6), shared=torch.arange(6, 9))
+    sharing = Groups.from_numbers([1, 2, 1, 1, 2], own=torch.arange(6), shared=torch.arange(6, 9))
     of_track = timed(sharing, cars)
     upright = state._replace(T_obj_cam=on_a_path(0.3 * random(9), None).T_obj_cam)
     fitted = with_path(CONFIG, sharing, of_track, upright)
@@ -206,7 +206,7 @@ def test_a_track_that_jumps_or_heads_elsewhere_is_held_by_next_to_nothing(
 ) -> None:
     """Three of five views are moved aside, or one is turned; half a turn is the detector's affair."""
     cars, _ = views(with_camera=False)
-    sharing = Groups.of([4] * 5, own=torch.arange(6), shared=torch.arange(6, 9))
+    sharing = Groups.from_numbers([4] * 5, own=torch.arange(6), shared=torch.arange(6, 9))
     path = torch.tensor([0.0, 0.0, 0.0, 20.0, 9.0, 0.0, 1.6, 0.0, 0.0], dtype=torch.float64)
     state = on_a_path(path, None)
     turn = torch.tensor([0, 0, 0, 0, math.radians(turned_deg), 0], dtype=torch.float64)
@@ -220,7 +220,7 @@ def test_a_track_that_jumps_or_heads_elsewhere_is_held_by_next_to_nothing(
 @pytest.mark.parametrize(("trusted", "hold"), [((0, 1, 2, 3, 4), 1e-4), ((0, 1, 3, 4), 1.0), ((), 1e-4)])
 def test_a_view_that_is_not_trusted_takes_the_path_from_nobody(trusted: tuple[int, ...], hold: float) -> None:
     cars, _ = views(with_camera=False)
-    sharing = Groups.of([4] * 5, own=torch.arange(6), shared=torch.arange(6, 9))
+    sharing = Groups.from_numbers([4] * 5, own=torch.arange(6), shared=torch.arange(6, 9))
     path = torch.tensor([0.0, 0.0, 0.0, 20.0, 9.0, 0.0, 1.6, 0.0, 0.0], dtype=torch.float64)
     T_cam_obj = se3.inverse(on_a_path(path, None).T_obj_cam)
     T_cam_obj[2, 0, 3] += 8.0

@@ -30,12 +30,11 @@ from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.errors import InputError
 from directshape_torch.refinement import outcome
 from directshape_torch.refinement import refined as refinements
-from directshape_torch.refinement.problem import CarProblem
+from directshape_torch.refinement.problem import CarMinimum, CarProblem
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.trust import EVIDENCE_NAMES
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.solver.sharing import Groups
 from directshape_torch.state.unknowns import POSE, AnyState
@@ -214,7 +213,9 @@ def doubt(monkeypatch: pytest.MonkeyPatch, *in_track: int, alone: int | None = N
     """Make views untrusted in calls or tracks of so many rows; return the sizes of all calls."""
     sizes: list[int] = []
 
-    def judged(minimum: Minimum[AnyState], initial: AnyState, *args: Any) -> tuple[Minimum[AnyState], RefinementResult]:
+    def judged(
+        minimum: CarMinimum[AnyState], initial: AnyState, *args: Any
+    ) -> tuple[CarMinimum[AnyState], RefinementResult]:
         minimum, found = outcome.judged(minimum, initial, *args)
         sizes.append(len(minimum.status))
         rows = in_track if isinstance(minimum.stage.problem.sharing, Groups) else (alone,)
@@ -288,7 +289,7 @@ def test_a_view_that_leaves_midway_leaves_the_track_as_without_it(monkeypatch: p
     without = of_tracks(0, 1, -1, 1, 0, 1)
     minimise = refinements.minimise
 
-    def failing(problem: CarProblem, *others: Any) -> Minimum[AnyState]:
+    def failing(problem: CarProblem, *others: Any) -> CarMinimum[AnyState]:
         minimum = minimise(problem, *others)
         if not isinstance(problem.sharing, Groups) or len(minimum.status) < 6:
             return minimum

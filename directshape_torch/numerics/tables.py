@@ -1,0 +1,174 @@
+"""Tables hold values of B cars; each field declares its axes, and the values of some of the cars follow from that.
+
+A table is a named tuple, or a frozen dataclass derived from `Table`. A field `Annotated[Tensor, Dense("B", 3)]` has a
+row for each car, and `Annotated[tuple[int, ...], Dense("B")]` has a number for each car that the host knows. Another
+axis belongs to cars if the table, or a table in it, has the car of each row: `Annotated[Tensor, Dense("M",
+numbers_of="B")]`, as `Blocks` do. All cars share the values of a field without declaration. The sizes of the axes
+B of cars, M of blocks and A of any entries vary from call to call, which compiled code must know.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import fields, is_dataclass, replace
+from functools import cache, cached_property
+from typing import Any, Protocol, Self, TypeVar, get_type_hints
+
+import torch
+from torch import Tensor
+
+from directshape_torch.numerics.records import Dense, dense_of
+
+_T = TypeVar("_T")
+_VARYING = frozenset("BMA")
+
+
+class _Kept:
+    """These are the rows of an axis that remain, in their order: those where `keep` holds."""
+
+    def __init__(self, keep: Tensor, count: int | None) -> None:
+        self.keep = keep  # (rows,) bool
+        self.count = count  # how many rows remain; None if the host does not know
+
+    @cached_property
+    def index(self) -> Tensor:
+        """The numbers (remaining,) of the rows that remain."""
+        if self.count is None:
+            return self.keep.nonzero()[:, 0]
+        return torch.nonzero_static(self.keep, size=self.count)[:, 0]
+
+    @cached_property
+    def new_number(self) -> Tensor:
+        """The new number (rows,) of each row that remains; other entries mean nothing."""
+        return torch.cumsum(self.keep.long(), 0) - 1
+
+
+class Chosen(_Kept):
+    """`Chosen` are some of B cars, or of B problems: those where `keep` (B,) holds.
+
+    The value is made once and passed on. The host knows the `numbers` of the chosen cars, so that whatever belongs to
+    them is found without waiting for the device.
+
+    Examples:
+        >>> Chosen.where(torch.tensor([False, True, True])).numbers
+        (1, 2)
+    """
+
+    def __init__(self, keep: Tensor, numbers: Sequence[int]) -> None:
+        super().__init__(keep, len(numbers))
+        self.numbers = tuple(numbers)
+
+    @classmethod
+    def where(cls, keep: Tensor) -> Chosen:
+        """The cars where `keep` (B,) holds; the host waits for the device."""
+        return cls(keep, keep.nonzero()[:, 0].tolist())
+
+
+class Table(Protocol):
+    """`Table` is the base of frozen dataclasses whose fields declare their axes."""
+
+    def of(self, cars: Chosen) -> Self:
+        """What the table holds of some of its cars."""
+        table: Self = _Cut(self, cars).inside(self)
+        return table
+
+
+def of(value: _T, cars: Chosen) -> _T:
+    """What a named tuple, or a tuple of tables, holds of some of its cars."""
+    part: _T = _Cut(value, cars).part(value)
+    return part
+
+
+def take_rows(value: _T, index: Tensor, axis: str = "B") -> _T:
+    """The rows `index` (R,) of an axis of a table and of tables in it, in that order; numbers of cars stay the same."""
+
+    def taken(part: Tensor, spec: Dense) -> Tensor:
+        return part.index_select(spec.shape.index(axis), index) if axis in spec.shape else part
+
+    return _changed(value, taken, lambda part: take_rows(part, index, axis)) if is_table(value) else value
+
+
+def declared(table: object) -> dict[str, Dense | None]:
+    """The declaration of each field of a named tuple or a dataclass, None where a field has no declaration."""
+    kind: Any = type(table)
+    return _declared_by(kind)
+
+
+@cache
+def _declared_by(kind: type) -> dict[str, Dense | None]:
+    names = [each.name for each in fields(kind)] if is_dataclass(kind) else getattr(kind, "_fields", ())
+    hints = get_type_hints(kind, include_extras=True) if names else {}
+    return {name: dense_of(hints[name]) for name in names}
+
+
+def varying_axes(spec: Dense | None) -> list[int]:
+    """The axes whose sizes vary from call to call."""
+    return [] if spec is None else [axis for axis, letter in enumerate(spec.shape) if letter in _VARYING]
+
+
+def is_table(value: object) -> bool:
+    """Whether a value may hold values of cars: a named tuple, a `Table`, or a tuple."""
+    return isinstance(value, tuple) or Table in type(value).__mro__
+
+
+class _Cut:
+    """A `_Cut` takes what a table, and the named tuples in it, hold of some cars; it asks the tables in it to do so."""
+
+    def __init__(self, table: object, cars: Chosen) -> None:
+        self.table, self.cars = table, cars
+        self.known: dict[int | str, _Kept | None] = {"B": cars}
+
+    def part(self, value: Any) -> Any:
+        """The part of the chosen cars in a value of any kind."""
+        if isinstance(value, tuple):
+            return self.inside(value)
+        return value.of(self.cars) if is_table(value) else value
+
+    def inside(self, table: Any) -> Any:
+        return _changed(table, self._declared, self.part)
+
+    def _declared(self, part: Any, spec: Dense) -> Any:
+        if isinstance(part, tuple):
+            return tuple(part[number] for number in self.cars.numbers)
+        for axis, letter in enumerate(spec.shape):
+            if (rows := self._rows(letter)) is not None:
+                part = part.index_select(axis, rows.index)
+        numbered = self._rows(spec.numbers_of)
+        return part if numbered is None else numbered.new_number[part]
+
+    def _rows(self, axis: int | str) -> _Kept | None:
+        """The rows of an axis that remain; None for an axis that does not belong to cars."""
+        if axis not in self.known:
+            self.known[axis] = None
+            if isinstance(axis, str) and (owner := _owner(self.table, axis)) is not None:
+                car, counts = owner
+                count = sum(counts[n] for n in self.cars.numbers) if isinstance(counts, tuple) else None
+                self.known[axis] = _Kept(self.cars.keep[car], count)
+        return self.known[axis]
+
+
+def _owner(table: object, axis: str) -> tuple[Tensor, object] | None:
+    """The car of each row of an axis, and how many rows each car has, from a table or from tables in it."""
+    specs = declared(table)
+    for name, spec in specs.items():
+        if spec is not None and spec.shape == (axis,) and spec.numbers_of == "B":
+            return getattr(table, name), getattr(table, "counts", None)
+    # Blocks come first, because the host knows how many of them each car has.
+    parts = getattr(table, "blocks", None), *(getattr(table, name) for name, spec in specs.items() if spec is None)
+    found = (_owner(part, axis) for part in parts if is_table(part))
+    return next((owner for owner in found if owner is not None), None)
+
+
+def _changed(value: Any, of_declared: Callable[[Any, Dense], Any], of_other: Callable[[Any], Any]) -> Any:
+    """A copy of a table, or of a tuple of tables, in which each field is changed by one of two functions."""
+    if type(value) is tuple:
+        return tuple(map(of_other, value))
+    changed: dict[str, Any] = {}
+    for name, spec in declared(value).items():
+        part = getattr(value, name)
+        if part is not None:
+            changed[name] = of_other(part) if spec is None else of_declared(part, spec)
+    changed = {name: part for name, part in changed.items() if part is not getattr(value, name)}
+    if not changed:
+        return value
+    return value._replace(**changed) if hasattr(value, "_replace") else replace(value, **changed)
