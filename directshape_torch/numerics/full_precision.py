@@ -19,12 +19,8 @@ _R = TypeVar("_R")
 
 # "none" means that nobody has asked for fewer digits.
 _FULL = ("none", "ieee")
-# These have the newer name of the setting, `fp32_precision`, which PyTorch has had since 2.9.
-_PRODUCTS: tuple[Any, ...] = tuple(
-    products
-    for products in (torch.backends.cuda.matmul, getattr(torch.backends.mkldnn, "matmul", None))
-    if hasattr(products, "fp32_precision")
-)
+# The newer name of the setting, `fp32_precision`, can be asked here, too, where old and new names were mixed.
+_PRODUCTS = (torch.backends.cuda.matmul, torch.backends.mkldnn.matmul)  # type: ignore[attr-defined]
 
 
 class _Setting(NamedTuple):
