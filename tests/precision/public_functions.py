@@ -366,6 +366,7 @@ WITHOUT_NUMBERS = {
     "NeuralShapePrior.load",
     "NeuralShapePrior.load_bundled", "NeuralShapePrior.save", "PCAShapePrior.get_extra_state", "PCAShapePrior.load",
     "PCAShapePrior.load_bundled", "PCAShapePrior.num_codes", "PCAShapePrior.save", "PCAShapePrior.set_extra_state",
+    "RefinerConfig.fits_images", "RefinerConfig.fits_points",
     "RefinementResult.refined", "RefinementResult.rows", "RefinementResult.status", "RefinementResult.to",
     "RigEstimate.add_pixels", "RigEstimate.add_results", "RigEstimate.content", "RigEstimate.get_extra_state",
     "RigEstimate.is_guess",
