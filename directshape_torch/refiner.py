@@ -22,7 +22,7 @@ from directshape_torch.numerics.tables import Chosen
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import fitting, refusals
 from directshape_torch.refinement.fusion import UNKNOWN_DETECTOR, fused, noise_of_boxes
-from directshape_torch.refinement.outcome import as_they_came
+from directshape_torch.refinement.make_result import unrefined_result
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.refined import Refined
 from directshape_torch.refinement.result import RefinementResult
@@ -214,14 +214,14 @@ class DirectShapeRefiner(nn.Module):
         problem = problem_of_scene(
             self.config, self.prior, frames, detections, cars, seen.of(usable), self.extra_terms, term_weights
         )
-        came = as_they_came(self.prior, frames, detections, failure, problem.term_names)
+        unrefined = unrefined_result(self.prior, frames, detections, failure, problem.term_names)
         if not len(rows):
-            return came
+            return unrefined
         initial = self._input_state(detections.T_cam_obj.index_select(0, rows), cars)
-        if len(rows) == len(came):
-            return self._minimise(problem, initial, cars, came)
-        found = self._minimise(problem, initial, cars, came.rows(rows))
-        return replace(came.put(rows, found), term_names=found.term_names)
+        if len(rows) == len(unrefined):
+            return self._minimise(problem, initial, cars, unrefined)
+        found = self._minimise(problem, initial, cars, unrefined.rows(rows))
+        return replace(unrefined.put(rows, found), term_names=found.term_names)
 
     @full_precision()
     def problem(
@@ -270,14 +270,14 @@ class DirectShapeRefiner(nn.Module):
         return replace(seen, points=car_points(matched, detections, self.config.point_cloud))
 
     def _minimise(
-        self, problem: CarProblem, initial: CarState, cars: CarBatch, came: RefinementResult
+        self, problem: CarProblem, initial: CarState, cars: CarBatch, unrefined: RefinementResult
     ) -> RefinementResult:
         if cars.track_id is None:
-            return Refined.of(problem, cars, initial, initial, came).result(initial)
+            return Refined.of(problem, cars, initial, initial, unrefined).result(initial)
         # The import stands here, because only cars in tracks need it.
         from directshape_torch.tracks.share import brought_together
 
-        return brought_together(problem, cars, initial, came)
+        return brought_together(problem, cars, initial, unrefined)
 
 
 def _config_cure(config: object) -> str:

@@ -27,7 +27,7 @@ NOISE_M = 0.025
 def made_up_scan(frames: FrameBatch, truth: Detections) -> Tensor:
     """Points (1, P, 3) where the rays of some left pixels meet the cars, metres."""
     problem, state = DirectShapeRefiner().problem(frames, truth)
-    hits = problem.look(state).hits
+    hits = problem.prepare(state).hits
     owner = problem.masks.rays.owner[: len(hits.found), None].expand(hits.found.shape)[hits.found]
     T_cam_obj, points_obj = truth.T_cam_obj[owner], hits.points_obj[:, hits.found].T
     points_cam = (T_cam_obj[:, :3, :3] @ points_obj[..., None])[..., 0] + T_cam_obj[:, :3, 3]

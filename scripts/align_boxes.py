@@ -138,10 +138,10 @@ def moved_costs(
 def _begun(problem: CarProblem, state: CarState, cars: CarBatch) -> tuple[Photometric, Surface]:
     """The photometric term with the pixels of the near sides, and the surface of these sides."""
     hits = box_hits(problem.masks.of_sides[0], state.T_obj_cam, cars.detector_hwl)
-    sight = problem.look(state)._replace(hits=hits)
-    term = problem.begin(-1, sight).photometric
+    prepared = problem.prepare(state)._replace(hits=hits)
+    term = problem.begin(-1, prepared).photometric
     assert term is not None, "the settings give this term a weight"
-    return term, term.where(sight)
+    return term, term.anchor(prepared)
 
 
 def _depth(state: CarState) -> Tensor:

@@ -30,7 +30,7 @@ from directshape_torch.terms.car_points import car_points
 from directshape_torch.terms.point_cloud import PointCloud
 from directshape_torch.terms.priors import PriorResidual, PriorTerm, height_prior
 from directshape_torch.terms.robust import RobustValue, quadratic
-from directshape_torch.terms.term import Linear, Nowhere, Sight, Term
+from directshape_torch.terms.term import Linear, NoAnchor, Prepared, Term
 
 
 def lower_by(metres: Tensor | float) -> Callable[[CarBatch, CarState], PriorResidual]:
@@ -130,8 +130,8 @@ def _linear(**changes: Callable[[Tensor], Tensor]) -> Callable[..., Any]:
 
 
 def _one_cost_for_all(self: PriorTerm, *arguments: Any) -> Any:
-    term, where, cost = PriorTerm.moving(self, *arguments)
-    return term, where, cost[:, 0]
+    term, anchor, cost = PriorTerm.changing_rows(self, *arguments)
+    return term, anchor, cost[:, 0]
 
 
 def _blocks(change: Callable[[Blocks], Blocks]) -> property:
@@ -199,7 +199,10 @@ BROKEN: dict[str, tuple[dict[str, Any], str]] = {
         {"norm": lambda self, residual: PriorTerm.norm(self, residual)._replace(hessian_weight=torch.ones(2))},
         r"'user': norm\(...\).hessian_weight: expected shape \(2, 1, 1\), got \(2,\)",
     ),
-    "one cost for all names": ({"moving": _one_cost_for_all}, r"the cost of moving\(...\): expected shape \(2, 1\)"),
+    "one cost for all names": (
+        {"changing_rows": _one_cost_for_all},
+        r"the cost of changing_rows\(...\): expected shape \(2, 1\)",
+    ),
     "cars that do not leave": (
         {"of": lambda self, _: self},
         r"'user' after of\(cars\): expected values for 1 cars, got .*; hand tensors",
@@ -257,11 +260,11 @@ class LowerTerm(Term):
         blocks = Blocks.one_each(len(cars), weight.device)
         return cls((name,), cars, blocks, weight, torch.zeros_like(blocks.owner), torch.ones(len(cars), 1, 1).double())
 
-    def linear(self, field: Field, state: CarState, where: Nowhere) -> Linear:
+    def linear(self, field: Field, state: CarState, anchor: NoAnchor) -> Linear:
         at, one = lower_by(0.1)(self.cars, state), torch.ones_like(self.row_weight)
-        return Linear(at.residual[..., None], one, at.J_residual_state, where)
+        return Linear(at.residual[..., None], one, at.J_residual_state, anchor)
 
-    def residual(self, field: Field, state: CarState, where: Nowhere) -> Tensor:
+    def residual(self, field: Field, state: CarState, anchor: NoAnchor) -> Tensor:
         return lower_by(0.1)(self.cars, state).residual[..., None]
 
     def norm(self, residual: Tensor) -> RobustValue:
@@ -301,8 +304,8 @@ class ResidualTerm(LowerTerm):
 class TwoToARow(ResidualTerm):
     """A `TwoToARow` has two residuals in each row, which have one inner scalar only if the term says which."""
 
-    def residual(self, field: Field, state: CarState, where: Nowhere) -> Tensor:
-        return super().residual(field, state, where).expand(-1, -1, 2)
+    def residual(self, field: Field, state: CarState, anchor: NoAnchor) -> Tensor:
+        return super().residual(field, state, anchor).expand(-1, -1, 2)
 
 
 def test_two_residuals_of_a_row_need_a_jacobian_by_hand() -> None:
@@ -351,7 +354,7 @@ def test_a_residual_that_is_none_is_named() -> None:
 
 def test_what_begins_a_term_with_a_jacobian_needs_none_itself() -> None:
     class Begins(ResidualTerm):
-        def begin(self, stage: Any, sight: Sight) -> Any:
+        def begin(self, stage: Any, prepared: Prepared) -> Any:
             return LowerTerm.on(self.names[0], self.cars)
 
     found = refine(lambda *scene: Begins.on("user", scene[2]))
@@ -362,7 +365,7 @@ def test_what_begins_a_term_with_a_jacobian_needs_none_itself() -> None:
 class TensorTerm(LowerTerm):
     """A `TensorTerm` looks at rows of one tensor, without a tuple around it."""
 
-    def where(self, sight: Sight) -> Tensor:
+    def anchor(self, prepared: Prepared) -> Tensor:
         return torch.ones(len(self.blocks.owner), 1)
 
 

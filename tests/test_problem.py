@@ -96,7 +96,7 @@ def _ended(problem: CarProblem, state: CarState, start: CarState | None = None) 
 def test_the_cost_that_accepts_is_the_one_whose_gradient_made_it(name: str) -> None:
     """At the input and at the end; before, with the vertex of coarse samples: 5 percent in the median, 44 at most."""
     problem, state = DirectShapeRefiner(PCAShapePrior.load_bundled().double()).problem(*_first_frame_of(name))
-    last = problem.begin(-1, problem.look(state))
+    last = problem.begin(-1, problem.prepare(state))
     ended = _ended(problem, state)
     assert isinstance(ended.stage, CarStage)
     silhouettes = "silhouette_left", "silhouette_right"
@@ -123,7 +123,7 @@ def _narrowed(iterations: CarIterations, at: Evaluation, cars: Chosen) -> tuple[
 def test_cars_that_leave_change_nothing_of_the_others(config: RefinerConfig, keep: list[int]) -> None:
     """In the middle of a stage, and once more among those that went on."""
     stage, state = begun_stage(config)
-    iterations, at = stage.start(stage.problem.look(state))
+    iterations, at = stage.start(stage.problem.prepare(state))
     kept = torch.zeros(5, dtype=torch.bool)
     kept[keep] = True
     fewer, at_fewer = _narrowed(iterations, at, Chosen(kept, keep))
@@ -140,7 +140,7 @@ def test_cars_that_leave_change_nothing_of_the_others(config: RefinerConfig, kee
 def test_the_state_moves_within_the_trust_region(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each of the three components of a rotation may reach its limit; codes stop at their bound."""
     stage, state = begun_stage()
-    iterations, _ = stage.start(stage.problem.look(state))
+    iterations, _ = stage.start(stage.problem.prepare(state))
     bounds: list[float] = []
     exp = se3.exp
 
@@ -191,8 +191,8 @@ def _figures(frames: FrameBatch, detections: Detections, step: Tensor | None, co
 def test_unknowns_that_a_stage_holds_are_constant_in_it(unknowns: Literal["pose", "shape"]) -> None:
     config = replace(DEFAULT, stages=(replace(DEFAULT.stages[1], unknowns=unknowns),))
     stage, state = begun_stage(config, 0)
-    _, held = stage.start(stage.problem.look(state))
-    _, free = begun_stage(DEFAULT)[0].start(stage.problem.look(state))
+    _, held = stage.start(stage.problem.prepare(state))
+    _, free = begun_stage(DEFAULT)[0].start(stage.problem.prepare(state))
     moving = torch.arange(9) < 6 if unknowns == "pose" else torch.arange(9) >= 6
     assert (held.gradient[:, ~moving] == 0).all()
     torch.testing.assert_close(held.gradient[:, moving], free.gradient[:, moving], rtol=1e-9, atol=1e-9)
@@ -279,5 +279,5 @@ def test_a_stage_follows_a_wider_contour_wherever_it_stands() -> None:
     prior, scene = cached_street()
     widths = replace(DEFAULT, stages=tuple(StageConfig(contour_width_px=width) for width in (0.5, 2.0, 0.5)))
     problem, state = DirectShapeRefiner(prior, widths).problem(scene.frames, scene.detections)
-    sight = problem.look(state)
-    assert [problem.begin(number, sight).after_wider for number in (0, 1, 2, -1)] == [False, False, True, True]
+    prepared = problem.prepare(state)
+    assert [problem.begin(number, prepared).after_wider for number in (0, 1, 2, -1)] == [False, False, True, True]

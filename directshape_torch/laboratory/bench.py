@@ -29,7 +29,7 @@ from directshape_torch.state.unknowns import State
 from directshape_torch.terms.check_term import car_products, check_same
 from directshape_torch.terms.depth import closest_of_march, first_hits, march
 from directshape_torch.terms.silhouette import contour_zeta
-from directshape_torch.terms.term import AnyTerm, Linear, Sight, Term, WhereT, linear_of
+from directshape_torch.terms.term import AnchorT, AnyTerm, Linear, Prepared, Term, linear_of
 from directshape_torch.tracks.next_view import NEXT_VIEW_NAME
 from directshape_torch.tracks.path import MOTION_NAMES, timed
 from directshape_torch.tracks.share import in_tracks
@@ -42,8 +42,8 @@ TERM_NAMES = (
 TRACK_NAMES = (*MOTION_NAMES, NEXT_VIEW_NAME)
 """These terms of views of a track exist only in the regime of a track."""
 
-# Each look begins where the previous one ended, so that tracked depths converge to the last digit.
-_LOOKS = 3
+# Each evaluation begins where the previous one ended, so that tracked depths converge to the last digit.
+_ROUNDS = 3
 _CELLS_TO_CHOOSE_FROM = 3000
 _CONTOUR = 3.0
 _GRAZING_COSINE = 0.3
@@ -58,7 +58,7 @@ class Bench:
     stage: CarStage  # begun, with default settings, a pose prior, points and the user's own terms
     terms: Mapping[str, AnyTerm]  # by the laboratory's names, in all forms including the paper's
     state: CarState | TrackState  # of the B cars
-    sight: Sight  # what the rays see of the state
+    prepared: Prepared  # what the rays see of the state
     rows: Mapping[str, Linear[Any]]  # residuals and factors of each term at the state
 
     @property
@@ -115,21 +115,21 @@ class Bench:
                 problem = _of_a_track(problem, cars, drawn.state.alone)
             # A track has only the last stage.
             number = min(regime.stage, len(problem.stages()) - 1)
-            stages.append(problem.begin(number, problem.look(start)))
+            stages.append(problem.begin(number, problem.prepare(start)))
         if own_terms:
             _check_refused(config, prior, scene, detections, cars, seen, own_terms)
         terms = _named(*stages)
-        sight = stages[0].problem.look(drawn.state)
-        rows = {name: rows_at(term, sight) for name, term in terms.items()}
-        return cls(regime, stages[0], terms, drawn.state, sight, rows)
+        prepared = stages[0].problem.prepare(drawn.state)
+        rows = {name: rows_at(term, prepared) for name, term in terms.items()}
+        return cls(regime, stages[0], terms, drawn.state, prepared, rows)
 
 
 @torch.no_grad()
-def rows_at(term: Term[WhereT], sight: Sight) -> Linear[WhereT]:
+def rows_at(term: Term[AnchorT], prepared: Prepared) -> Linear[AnchorT]:
     """The rows of a term at a state, with depths as precise as the dtype allows."""
-    at = linear_of(term, sight.field, sight.state, term.where(sight))
-    for _ in range(_LOOKS):
-        at = linear_of(term, sight.field, sight.state, at.where)
+    at = linear_of(term, prepared.field, prepared.state, term.anchor(prepared))
+    for _ in range(_ROUNDS):
+        at = linear_of(term, prepared.field, prepared.state, at.anchor)
     return at
 
 
@@ -163,19 +163,19 @@ def _check_refused(
     own_terms: Sequence[TermFactory],
 ) -> None:
     """Raise `InputError` unless a user's terms give equal values for cars with and without the first car."""
-    everybody, others = (Chosen.where(torch.arange(len(cars)) > car) for car in (-1, 0))
+    everyone, others = (Chosen.where(torch.arange(len(cars)) > car) for car in (-1, 0))
     all_cars, few = (
         problem_of_scene(config, prior, scene.frame, detections, cars.of(kept), seen.of(kept), own_terms)
-        for kept in (everybody, others)
+        for kept in (everyone, others)
     )
     for before, now in zip(all_cars.of(others).extra_terms, few.extra_terms, strict=True):
         code = prior.initial_code(len(cars) - 1).to(cars.detector_T_cam_obj)
         state = CarState.of(se3.inverse(cars.detector_T_cam_obj[others.index]), code, cars.num_offsets)
-        sight = few.look(state)
+        prepared = few.prepare(state)
         stage = config.stages[0]
         products = [
-            car_products(term, sight.field, state, term.where(sight))
-            for term in (before.begin(stage, sight), now.begin(stage, sight))
+            car_products(term, prepared.field, state, term.anchor(prepared))
+            for term in (before.begin(stage, prepared), now.begin(stage, prepared))
         ]
         called = f"extra term {now.names[0]!r} of the cars that were not refused"
         check_same(called, products[1], products[0], range(len(cars) - 1))
@@ -188,7 +188,7 @@ def _of_a_track(problem: CarProblem, cars: CarBatch, state: CarState) -> CarProb
     T_world_cam = se3.exp(time_s[:, None] * time_s.new_tensor([0.5, 0.0, 10.0, 0.0, 0.2, 0.0]))
     sharing = Groups.from_numbers([0] * len(cars), *own_and_shared(state))
     views = timed(sharing, replace(cars, time_s=time_s, T_world_cam=T_world_cam))
-    return in_tracks(problem, sharing, views, state, sharing.everybody, (number + 1).clamp_max(len(cars) - 1))
+    return in_tracks(problem, sharing, views, state, sharing.all_members, (number + 1).clamp_max(len(cars) - 1))
 
 
 def _named(stage: CarStage, other_forms: CarStage) -> dict[str, AnyTerm]:

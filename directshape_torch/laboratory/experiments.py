@@ -14,7 +14,7 @@ from torch import Tensor
 from directshape_torch.laboratory.bench import Bench
 from directshape_torch.laboratory.differences import Evaluate
 from directshape_torch.shape.field import field_of
-from directshape_torch.terms.term import Linear, Term, WhereT, by_autograd, linear_of
+from directshape_torch.terms.term import AnchorT, Linear, Term, by_autograd, linear_of
 
 # The samples of the paper's product lie between the bounds of the grid and move with the bounds. By definition they are
 # constants of a linearisation, so its Jacobian is the Jacobian of the residual at fixed samples.
@@ -53,20 +53,20 @@ def term_experiment(bench: Bench, names: Sequence[str]) -> Experiment:
     """The experiment on every counted residual of the named terms of a bench, by twist and code.
 
     `Term.linear` gives the hand-derived Jacobian, and autograd differentiates `Term.residual` at equal points.
-    Differences use the residuals that `Term.linear` gives at displaced states, where it looks anew, as it does for the
+    Differences use the residuals that `Term.linear` gives at displaced states, with anchors anew, as it does for the
     solver.
     """
     terms = [bench.terms[name] for name in names]
     rows = [bench.rows[name] for name in names]
     counts = [_counts(term, at) for term, at in zip(terms, rows, strict=True)]
-    witness = by_autograd(terms, bench.problem.prior, bench.state, [at.where for at in rows])
+    witness = by_autograd(terms, bench.problem.prior, bench.state, [at.anchor for at in rows])
 
     def evaluate(delta: Tensor) -> list[Tensor]:
         state = bench.moved(delta)
         field = field_of(bench.problem.prior.bind(state.code))
         residuals = (
-            term.residual(field, state, at.where) if name in AT_FIXED_DEPTHS
-            else term.linear(field, state, at.where).residual
+            term.residual(field, state, at.anchor) if name in AT_FIXED_DEPTHS
+            else term.linear(field, state, at.anchor).residual
             for name, term, at in zip(names, terms, rows, strict=True)
         )  # fmt: skip
         return [residual[count] for residual, count in zip(residuals, counts, strict=True)]
@@ -91,7 +91,7 @@ def gradient_experiment(bench: Bench, names: Sequence[str]) -> Experiment:
     def gradients(delta: Tensor) -> list[Tensor]:
         state = bench.moved(delta)
         field = field_of(bench.problem.prior.bind(state.code))
-        moved = (linear_of(term, field, state, at.where) for term, at in zip(terms, rows, strict=True))
+        moved = (linear_of(term, field, state, at.anchor) for term, at in zip(terms, rows, strict=True))
         return [row_gradients(t, at)[m].flatten() for t, at, m in zip(terms, moved, moving, strict=True)]
 
     jacobians = torch.func.jacfwd(gradients)(torch.zeros_like(_units(bench)))
@@ -101,18 +101,18 @@ def gradient_experiment(bench: Bench, names: Sequence[str]) -> Experiment:
     return Experiment(tuple(subjects), gradients, _units(bench))
 
 
-def jacobian(at: Linear[WhereT]) -> Tensor:
+def jacobian(at: Linear[AnchorT]) -> Tensor:
     """`J_residual_state` (M, R, N, D)."""
     return at.J_residual_inner[..., None] * at.J_inner_state[:, :, None]
 
 
-def row_gradients(term: Term[WhereT], at: Linear[WhereT]) -> Tensor:
+def row_gradients(term: Term[AnchorT], at: Linear[AnchorT]) -> Tensor:
     """Part (M, R, D) that each row adds to the gradient of its car, before the weight of its block."""
     inner = (term.row_weight * term.norm(at.residual).gradient_weight * at.J_residual_inner).sum(dim=-1)
     return inner[..., None] * at.J_inner_state
 
 
-def _counts(term: Term[WhereT], at: Linear[WhereT]) -> Tensor:
+def _counts(term: Term[AnchorT], at: Linear[AnchorT]) -> Tensor:
     return (term.row_weight > 0).expand_as(at.residual)
 
 

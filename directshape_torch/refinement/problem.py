@@ -1,6 +1,6 @@
 """This module presents the energy of B cars (E in the paper) to the solver, with its stages and iterations.
 
-No object here keeps changing state: a look at a state, the stage that begins there and every evaluation are values that
+No object here keeps changing state: a prepared state, the stage that begins there and every evaluation are values that
 are passed on.
 """
 
@@ -35,7 +35,7 @@ from directshape_torch.terms.term import (
     Evidence,
     Figures,
     Part,
-    Sight,
+    Prepared,
     by_autograd,
     linear_of,
     part_of,
@@ -52,7 +52,7 @@ class CarProblem(Table):
     prior: ShapePrior  # the family of shapes
     evidence: tuple[Evidence, ...]  # what the summands of the energy are made of
     extra_terms: tuple[AnyTerm, ...]  # a user's own summands, whose columns come last
-    masks: MaskRows  # the rays of both images, left ones first, used by everything that looks at a state
+    masks: MaskRows  # the rays of both images, left ones first, used wherever rays are cast
     config: RefinerConfig  # stages, trust region, samples per ray
     # These factors (B, T) multiply the columns of costs of each car in addition to the weights of the terms. None
     # stands for 1.
@@ -72,7 +72,7 @@ class CarProblem(Table):
         return next((each for each in self.evidence if name in each.names), None)
 
     def parts(
-        self, terms: tuple[AnyTerm, ...], field: Field, state: State, wheres: tuple[object, ...], fisher: bool = True
+        self, terms: tuple[AnyTerm, ...], field: Field, state: State, anchors: tuple[object, ...], fisher: bool = True
     ) -> tuple[Part[Any], ...]:
         """What terms of the problem, for all or fewer cars, say of a state; `fisher` asks for the Fisher information.
 
@@ -81,26 +81,26 @@ class CarProblem(Table):
         `compile.compilable`.
         """
         own = len(terms) - len(self.extra_terms)
-        extra = zip(terms[own:], wheres[own:], strict=True)
-        of_extra = tuple(part_of(term, linear_of(term, field, state, where)) for term, where in extra)
+        extra = zip(terms[own:], anchors[own:], strict=True)
+        of_extra = tuple(part_of(term, linear_of(term, field, state, anchor)) for term, anchor in extra)
         # Compiled code always computes the Fisher information, so that it has one form.
-        return parts_of(terms[:own], field, state, wheres[:own], fisher or will_compile()) + of_extra
+        return parts_of(terms[:own], field, state, anchors[:own], fisher or will_compile()) + of_extra
 
-    def look(self, state: State) -> Sight:
+    def prepare(self, state: State) -> Prepared:
         """March every ray at a state: what rays see are constants, but state and field keep their graphs."""
         with torch.no_grad():
             field = field_of(self.prior.bind(state.code))
             bounds, num_samples = self.prior.bounds_obj, self.config.silhouette.samples_per_ray
             views = marched_views(*self.masks.of_sides, bounds, num_samples, field, state.T_obj_cam)
-        return Sight(state, field_of(self.prior.bind(state.code)) if torch.is_grad_enabled() else field, *views)
+        return Prepared(state, field_of(self.prior.bind(state.code)) if torch.is_grad_enabled() else field, *views)
 
-    def begin(self, stage: int, sight: Sight) -> CarStage:
+    def begin(self, stage: int, prepared: Prepared) -> CarStage:
         """The stage with number `stage`; it fixes at a state all that must stay constant while costs are compared."""
         stages = self.stages()
         config, earlier = stages[stage], stages[: range(len(stages))[stage]]
         after_wider = any(other.contour_width_px > config.contour_width_px for other in earlier)
-        terms = tuple(each.begin(config, sight) for each in (*self.evidence, *self.extra_terms))
-        return CarStage(self, config, terms, after_wider, sight.state.unknowns)
+        terms = tuple(each.begin(config, prepared) for each in (*self.evidence, *self.extra_terms))
+        return CarStage(self, config, terms, after_wider, prepared.state.unknowns)
 
 
 @dataclass(frozen=True)
@@ -144,11 +144,11 @@ class CarStage:
         """The terms in the form of compiled code, in which they are constants; `terms` may be differentiated."""
         return tuple(with_varying(term) for term in self.terms)
 
-    def figures(self, sight: Sight) -> Figures:
+    def figures(self, prepared: Prepared) -> Figures:
         """The energy of each column at a state, with every ray marched; differentiable if gradients are enabled."""
         terms = self.terms if torch.is_grad_enabled() else self._constant_terms
-        wheres = tuple(term.where(sight) for term in terms)
-        parts = self.problem.parts(terms, sight.field, sight.state, wheres)
+        anchors = tuple(term.anchor(prepared) for term in terms)
+        parts = self.problem.parts(terms, prepared.field, prepared.state, anchors)
         layout = _Layout.of(self.terms, self.problem.factors)
         cells = CarSums.of(layout.owner * layout.num_columns + layout.column, layout.num_cars * layout.num_columns)
         cost, products = (torch.cat(x) for x in zip(*(part[:2] for part in parts), strict=True))
@@ -167,23 +167,23 @@ class CarStage:
             parts,
         )
 
-    def start(self, sight: Sight) -> tuple[CarIterations, Evaluation]:
+    def start(self, prepared: Prepared) -> tuple[CarIterations, Evaluation]:
         """The problem of the iterations, and the energy where they begin."""
         problem = self.problem
         # The marched energy is differentiated afterwards, so its minimum must be found. This holds under `no_grad` too,
         # so that evaluation and training give equal results.
         if problem.config.solver.rays == "marched" or problem.config.backward.mode != "none":
             terms, rest = self._iterated_terms(), None
-            wheres = tuple(term.where(sight) for term in terms)
+            anchors = tuple(term.anchor(prepared) for term in terms)
         else:
-            moving = [term.moving(sight, self.after_wider) for term in self._iterated_terms()]
-            terms, wheres, costs = (tuple(x) for x in zip(*moving, strict=True))
+            moving = [term.changing_rows(prepared, self.after_wider) for term in self._iterated_terms()]
+            terms, anchors, costs = (tuple(x) for x in zip(*moving, strict=True))
             by_column = torch.cat(costs, dim=1)
             rest = (by_column if problem.factors is None else by_column * problem.factors).sum(dim=1)
         # Rays are marched again only where nothing is known to rest.
         masks = problem.masks if rest is None else None
         iterations = CarIterations(self, terms, rest, problem.factors, masks, problem.sharing)
-        return iterations, iterations.evaluated(sight.field, sight.state, wheres)
+        return iterations, iterations.evaluated(prepared.field, prepared.state, anchors)
 
     def _iterated_terms(self) -> tuple[AnyTerm, ...]:
         """The terms with the library's priors joined, if cars have no factors; a user's terms stay separate.
@@ -199,10 +199,10 @@ class CarStage:
     def linearise_differentiably(self, state: State) -> Evaluation:
         """The hand-derived linearisation with an autograd graph to state, images, masks, prior and weights."""
         with torch.no_grad():
-            sight = self.problem.look(state)
-            wheres = tuple(term.where(sight) for term in self.terms)
+            prepared = self.problem.prepare(state)
+            anchors = tuple(term.anchor(prepared) for term in self.terms)
         field, layout = field_of(self.problem.prior.bind(state.code)), _Layout.of(self.terms, self.problem.factors)
-        parts = self.problem.parts(self.terms, field, state, wheres)
+        parts = self.problem.parts(self.terms, field, state, anchors)
         return self.without_held(summed(layout.sums(), layout.weight, parts))
 
     def without_held(self, at: Evaluation) -> Evaluation:
@@ -286,21 +286,21 @@ class CarIterations(Table):
         return tuple(with_varying(term) for term in self.terms)
 
     def evaluate(self, state: State, near: Evaluation) -> Evaluation:
-        """The energy at a state; the terms look near the points of the evaluation `near`."""
+        """The energy at a state; the anchors of the terms come from the evaluation `near`."""
         problem = self.stage.problem
         if self.masks is not None:
-            sight = replace(problem, masks=self.masks).look(state)
-            return self.evaluated(sight.field, state, tuple(term.where(sight) for term in self.terms))
-        return self.evaluated(field_of(problem.prior.bind(state.code)), state, near.wheres)
+            prepared = replace(problem, masks=self.masks).prepare(state)
+            return self.evaluated(prepared.field, state, tuple(term.anchor(prepared) for term in self.terms))
+        return self.evaluated(field_of(problem.prior.bind(state.code)), state, near.anchors)
 
-    def evaluated(self, field: Field, state: State, wheres: tuple[object, ...]) -> Evaluation:
-        """The energy at a state; the terms look near the points `wheres`."""
+    def evaluated(self, field: Field, state: State, anchors: tuple[object, ...]) -> Evaluation:
+        """The energy at a state; the terms are evaluated near their anchors."""
         problem, terms = self.stage.problem, self._constant_terms
-        parts = problem.parts(terms, field, state, wheres, fisher=False)
+        parts = problem.parts(terms, field, state, anchors, fisher=False)
         if problem.config.solver.jacobian == "autograd":
-            looked = [part.where for part in parts]
-            rows = by_autograd(terms, problem.prior, state, looked)
-            parts = tuple(part_of_rows(t, *r, where) for t, r, where in zip(terms, rows, looked, strict=True))
+            anchors = tuple(part.anchor for part in parts)
+            rows = by_autograd(terms, problem.prior, state, anchors)
+            parts = tuple(part_of_rows(t, *r, anchor) for t, r, anchor in zip(terms, rows, anchors, strict=True))
         at = summed(self._sums, self.layout.weight, parts)
         cost = at.cost if self.rest is None else at.cost + self.rest
         return self.stage.without_held(at._replace(cost=cost))
@@ -315,7 +315,7 @@ class CarIterations(Table):
         def chosen(accepted: Tensor, new: object, old: object) -> object:
             return map_tensors(lambda x, y: torch.where(accepted, x, y), new, old)
 
-        return Evaluation(cost, gradient, hessian, tuple(map(chosen, of_blocks, new.wheres, old.wheres)))
+        return Evaluation(cost, gradient, hessian, tuple(map(chosen, of_blocks, new.anchors, old.anchors)))
 
     def retract(self, state: AnyState, step: Tensor) -> AnyState:
         """The state moved by tangent vectors (B, D) within the trust region."""
@@ -326,14 +326,14 @@ class CarIterations(Table):
         """The evaluation of some of the cars."""
         cost, gradient, hessian = (x.index_select(0, cars.index) for x in at[:3])
 
-        def kept(term: AnyTerm, where: object) -> object:
+        def kept(term: AnyTerm, anchor: object) -> object:
             blocks = term.blocks.kept(cars)
-            return map_tensors(lambda x: x.index_select(-2, blocks), where)
+            return map_tensors(lambda x: x.index_select(-2, blocks), anchor)
 
-        return Evaluation(cost, gradient, hessian, tuple(map(kept, self.terms, at.wheres)))
+        return Evaluation(cost, gradient, hessian, tuple(map(kept, self.terms, at.anchors)))
 
 
-CarMinimum: TypeAlias = Minimum[AnyState, Sight, Evaluation, Figures]
+CarMinimum: TypeAlias = Minimum[AnyState, Prepared, Evaluation, Figures]
 """A `CarMinimum` is the result of minimising a `CarProblem`."""
 
 

@@ -15,7 +15,7 @@ from directshape_torch.refinement.trust import bundled_trust_model
 from directshape_torch.rows import CarSums
 from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.silhouette import MaskRows
-from directshape_torch.terms.term import Figures, Part, Sight
+from directshape_torch.terms.term import Figures, Part, Prepared
 
 # Images that show only noise have this contrast, in grey levels.
 _LEAST_CONTRAST = 0.3
@@ -52,7 +52,7 @@ class FitQuality(CarRecord):
 def fit_quality(
     stage: CarStage,
     figures: Figures,
-    seen: Sight,
+    prepared: Prepared,
     halves_apart: Tensor,
     distance_in_sigmas: Tensor,
     chances: tuple[Tensor, Tensor],
@@ -62,12 +62,12 @@ def fit_quality(
     Args:
         stage: the last stage of the refinement.
         figures: the energy at the final states.
-        seen: what the rays see at the final states.
+        prepared: the final states, with what their rays hit.
         halves_apart: (B,) see `DisparityProfile.halves_apart`.
         distance_in_sigmas: (B,) distance from the detector's box, see `DetectorComparison`.
         chances: two probabilities (B,) of a better box and of a box that is not worse, if the car is there.
     """
-    left, right = mask_ious(stage.problem.masks, seen)
+    left, right = mask_ious(stage.problem.masks, prepared)
     error, share, contrast = [torch.full_like(left, torch.nan)] * 3
     photometric, at = stage.photometric, stage.photometric_part(figures)
     if photometric is not None and at is not None:
@@ -84,11 +84,11 @@ def fit_quality(
     return FitQuality(left, right, error, share, evidence, *(is_there * chance for chance in chances))
 
 
-def mask_ious(masks: MaskRows, seen: Sight) -> Tensor:
+def mask_ious(masks: MaskRows, prepared: Prepared) -> Tensor:
     """IoU (2, B) of shape and mask over the pixels of the left and the right image."""
-    distance = seen.field.sdf(seen.closest.points_obj, masks.rays.owner)
+    distance = prepared.field.sdf(prepared.closest.points_obj, masks.rays.owner)
     counts = masks.filled.to(torch.float64)
-    covered, masked = seen.closest.crosses & (distance < 0), masks.foreground > MASK_THRESHOLD
+    covered, masked = prepared.closest.crosses & (distance < 0), masks.foreground > MASK_THRESHOLD
     both, either = ((x * counts).sum(dim=1) for x in (covered & masked, covered | masked))
     num_cars = len(masks.blocks.counts)
     sums = CarSums.of(masks.rays.owner + num_cars * masks.side, 2 * num_cars)
@@ -102,7 +102,7 @@ def photometric_agreement(term: Photometric, at: Part[Surface]) -> tuple[Tensor,
     Residual and contrast are in grey levels. The contrast (B,) is the mean absolute deviation of grey levels from the
     mean of their neighbourhood.
     """
-    fixed, usable = term.pixel_set, at.where.usable
+    fixed, usable = term.pixel_set, at.anchor.usable
     in_set = usable & (fixed.rows.pixel_weight > 0)
     neighbours = fixed.rows.neighbour_weight.movedim(0, -1)
     weight, grey = in_set[..., None] * neighbours, fixed.rows.intensity_left.movedim(0, -1)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.numerics.tables import Chosen, take_rows
-from directshape_torch.refinement.outcome import at_states, judged, outcome_of
+from directshape_torch.refinement.make_result import at_states, judged, result_of
 from directshape_torch.refinement.problem import CarMinimum, CarProblem
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.solver.differentiate import implicit_state, unrolled_state
@@ -31,7 +31,7 @@ class Refined(Generic[AnyState]):
 
     @classmethod
     def of(
-        cls, problem: CarProblem, cars: CarBatch, initial: AnyState, start: AnyState, came: RefinementResult
+        cls, problem: CarProblem, cars: CarBatch, initial: AnyState, start: AnyState, unrefined: RefinementResult
     ) -> Refined[AnyState]:
         """Minimise the problem and judge the cars.
 
@@ -45,7 +45,7 @@ class Refined(Generic[AnyState]):
         repeats_steps = torch.is_grad_enabled() and problem.config.backward.mode == "unroll"
         with torch.no_grad():
             minimum = minimise(problem, initial, problem.config.solver, start, repeats_steps)
-            found = outcome_of(problem, minimum, cars, came)
+            found = result_of(problem, minimum, cars, unrefined)
             return cls(problem, cars, *judged(minimum, initial, found, problem.config.acceptance))
 
     def result(self, start: AnyState) -> RefinementResult:

@@ -93,10 +93,10 @@ def _check_extra(problem: CarProblem, cars: CarBatch) -> None:
     if not problem.extra_terms:
         return
     code = problem.prior.initial_code(len(cars)).to(cars.detector_T_cam_obj)
-    sight = problem.look(CarState.of(se3.inverse(cars.detector_T_cam_obj), code, cars.num_offsets))
+    prepared = problem.prepare(CarState.of(se3.inverse(cars.detector_T_cam_obj), code, cars.num_offsets))
     names = [name for each in problem.evidence for name in each.names]
     for term in problem.extra_terms:
-        check_term(term, problem.stages()[0], sight, names, lambda code: field_of(problem.prior.bind(code)))
+        check_term(term, problem.stages()[0], prepared, names, lambda code: field_of(problem.prior.bind(code)))
         names += term.names
 
 

@@ -19,8 +19,8 @@ from directshape_torch.solver.problem import (
     EnergyAt,
     EvaluationT,
     FiguresT,
+    PreparedT,
     Problem,
-    SightT,
     Stage,
     StateT,
     remade,
@@ -37,9 +37,9 @@ class StartNotReachedWarning(UserWarning):
 
 
 def unrolled_state(
-    problem: Problem[StateT, SightT, EvaluationT, FiguresT],
+    problem: Problem[StateT, PreparedT, EvaluationT, FiguresT],
     start: StateT,
-    minimum: Minimum[StateT, SightT, EvaluationT, FiguresT],
+    minimum: Minimum[StateT, PreparedT, EvaluationT, FiguresT],
     rows: Tensor,
     num_iterations: int,
     names: Tensor | None = None,
@@ -78,7 +78,7 @@ def unrolled_state(
             began = take_rows(minimum.stage_starts[begun], rows)
             # The state at which a stage begins is a function, too, where the repeated steps have led to it.
             began = where_rows(led_here, _with_values(began, state), began)
-            stage = problem.begin(begun, problem.look(began))
+            stage = problem.begin(begun, problem.prepare(began))
         state = where_rows(taken, _step(problem, stage, state, iteration), state)
         led_here = led_here | taken
     return _with_values(take_rows(minimum.state, rows), state)
@@ -105,8 +105,8 @@ def _first_states(trajectory: Sequence[Iteration[StateT]], repeated: Tensor) -> 
 
 
 def implicit_state(
-    problem: Problem[StateT, SightT, EvaluationT, FiguresT],
-    minimum: Minimum[StateT, SightT, EvaluationT, FiguresT],
+    problem: Problem[StateT, PreparedT, EvaluationT, FiguresT],
+    minimum: Minimum[StateT, PreparedT, EvaluationT, FiguresT],
     rows: Tensor,
     *,
     exact: bool,
@@ -133,16 +133,16 @@ def implicit_state(
     """
     state = take_rows(minimum.state, rows)
     with torch.no_grad():
-        seen = problem.look(take_rows(minimum.stage_starts[-1], rows))
-    stage = problem.begin(-1, seen)
+        prepared = problem.prepare(take_rows(minimum.stage_starts[-1], rows))
+    stage = problem.begin(-1, prepared)
     free = stage.free_unknowns(state)
     delta = torch.zeros(free.shape, dtype=torch.float64, device=free.device)
     at, J = _gradient_and_its_jacobian(stage, state, delta, exact)
     both = free[:, :, None] & free[:, None, :]
     J = torch.where(both, J, torch.eye(J.shape[-1], dtype=J.dtype, device=J.device))
     step, has_step = problem.sharing.newton_step(J, torch.where(free, at.gradient, torch.zeros_like(at.gradient)))
-    everybody = torch.ones_like(has_step)
-    size = problem.sharing.largest(step_size(step.detach(), stage.step_limits().to(step)), everybody)
+    everyone = torch.ones_like(has_step)
+    size = problem.sharing.largest(step_size(step.detach(), stage.step_limits().to(step)), everyone)
     stationary = has_step & (size <= max_remaining_step)  # a comparison with NaN is false
     _warn_of_the_others(stationary, rows if names is None else names)
     step = torch.where(stationary[:, None], step, 0.0)
@@ -150,7 +150,7 @@ def implicit_state(
 
 
 def _gradient_and_its_jacobian(
-    stage: Stage[StateT, SightT, EvaluationT, FiguresT], state: StateT, delta: Tensor, exact: bool
+    stage: Stage[StateT, PreparedT, EvaluationT, FiguresT], state: StateT, delta: Tensor, exact: bool
 ) -> tuple[EnergyAt, Tensor]:
     """The gradient g with its graph to the problem, and its Jacobian (R, D, D) by the tangent, without a graph."""
     if not exact:
@@ -190,8 +190,8 @@ def _listed(numbers: Sequence[int]) -> str:
 
 
 def _step(
-    problem: Problem[StateT, SightT, EvaluationT, FiguresT],
-    stage: Stage[StateT, SightT, EvaluationT, FiguresT],
+    problem: Problem[StateT, PreparedT, EvaluationT, FiguresT],
+    stage: Stage[StateT, PreparedT, EvaluationT, FiguresT],
     state: StateT,
     iteration: Iteration[StateT],
 ) -> StateT:

@@ -17,8 +17,8 @@ from directshape_torch.solver.iteration import RUNNING, IterationOutcome, begin,
 from directshape_torch.solver.problem import (
     EvaluationT,
     FiguresT,
+    PreparedT,
     Problem,
-    SightT,
     Stage,
     StateT,
     put_rows,
@@ -44,7 +44,7 @@ class Iteration(Table, Generic[StateT]):
 
 
 @dataclass(frozen=True)
-class Minimum(Generic[StateT, SightT, EvaluationT, FiguresT]):
+class Minimum(Generic[StateT, PreparedT, EvaluationT, FiguresT]):
     """A `Minimum` is the result of a minimisation."""
 
     state: StateT  # final states, which are the input states where the status says so
@@ -55,8 +55,8 @@ class Minimum(Generic[StateT, SightT, EvaluationT, FiguresT]):
     # Costs of different stages are not comparable
     cost_history: Tensor
     stage_starts: tuple[StateT, ...]  # states at which each stage began and fixed its sets
-    stage: Stage[StateT, SightT, EvaluationT, FiguresT]  # the last stage that has begun, of all problems
-    seen_end: SightT  # what the problem's `look` gave where the iterations ended
+    stage: Stage[StateT, PreparedT, EvaluationT, FiguresT]  # the last stage that has begun, of all problems
+    prepared_end: PreparedT  # from `prepare`, at the states where the iterations ended
     before: FiguresT  # the last stage's figures at the input states
     after: FiguresT  # the last stage's figures where the iterations ended
     trajectory: tuple[Iteration[StateT], ...] = ()  # all iterations in order, if they were asked for
@@ -111,12 +111,12 @@ class _Log(Generic[StateT]):
 
 @full_precision()
 def minimise(
-    problem: Problem[StateT, SightT, EvaluationT, FiguresT],
+    problem: Problem[StateT, PreparedT, EvaluationT, FiguresT],
     initial: StateT,
     config: SolverConfig,
     start: StateT | None = None,
     record: bool = False,
-) -> Minimum[StateT, SightT, EvaluationT, FiguresT]:
+) -> Minimum[StateT, PreparedT, EvaluationT, FiguresT]:
     """Run the stages of a problem one after the other, then compare the outcome with the input.
 
     Numerical trouble never raises: the problem concerned gets a status and its input state, the others go on.
@@ -129,8 +129,10 @@ def minimise(
         record: whether to keep the trajectory.
     """
     with torch.no_grad():
-        seen_initial = problem.look(initial)
-        state, seen = (initial, seen_initial) if start is None or start is initial else (start, problem.look(start))
+        prepared_initial = problem.prepare(initial)
+        state, prepared = (
+            (initial, prepared_initial) if start is None or start is initial else (start, problem.prepare(start))
+        )
         num_problems = len(initial[0])
         ended = torch.full((num_problems,), RUNNING, device=initial[0].device)
         iterations = torch.zeros_like(ended)
@@ -139,13 +141,15 @@ def minimise(
         starts: list[StateT] = []
         trajectory: list[Iteration[StateT]] | None = [] if record else None
         for number, config_of_stage in enumerate(problem.stages()):
-            stage = problem.begin(number, seen)
+            stage = problem.begin(number, prepared)
             starts.append(state)
             log = _Log(history, trajectory, len(starts) - 1, state, config_of_stage.over_relaxation)
-            state, ended, done, unfailed = _run_stage(stage, config_of_stage, state, seen, ended, unfailed, config, log)
+            state, ended, done, unfailed = _run_stage(
+                stage, config_of_stage, state, prepared, ended, unfailed, config, log
+            )
             iterations = iterations + done
-            seen = problem.look(state)
-        before, after = stage.figures(seen_initial), stage.figures(seen)
+            prepared = problem.prepare(state)
+        before, after = stage.figures(prepared_initial), stage.figures(prepared)
         # Costs are compared at the final stage, so that no problem ends worse than it began.
         status = torch.where(ended < 0, Status.max_iterations.code, ended)
         worse = ~(after.cost <= before.cost)
@@ -159,7 +163,7 @@ def minimise(
             cost_history=torch.cat(history, dim=1) if history else nothing,
             stage_starts=tuple(starts),
             stage=stage,
-            seen_end=seen,
+            prepared_end=prepared,
             before=before,
             after=after,
             trajectory=tuple(trajectory or ()),
@@ -167,10 +171,10 @@ def minimise(
 
 
 def _run_stage(
-    begun: Stage[StateT, SightT, EvaluationT, FiguresT],
+    begun: Stage[StateT, PreparedT, EvaluationT, FiguresT],
     stage: StageConfig,
     state: StateT,
-    seen: SightT,
+    prepared: PreparedT,
     ended: Tensor,
     unfailed: Chosen,
     config: SolverConfig,
@@ -181,7 +185,7 @@ def _run_stage(
     numbers: Sequence[int] = unfailed.numbers
     if not numbers:
         return state, ended, iterations, unfailed
-    part, at_state = begun.start(seen)
+    part, at_state = begun.start(prepared)
     progress = begin(state, at_state, ended, config)
     rows = torch.arange(len(ended), device=ended.device)
     if len(numbers) < len(ended):

@@ -1,7 +1,7 @@
 """This module says what the solver needs of a batch of B least-squares problems of D unknowns each.
 
-`look` prepares a problem at a state. A stage begins at that state, and its iterations evaluate state after state, each
-near the state before. All results are values, which a caller may keep for later.
+`prepare` fixes what depends on one state. A stage begins at that state, and its iterations evaluate state after state,
+each near the state before. All results are values, which a caller may keep for later.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class EnergyAt(Protocol):
         ...
 
 
-SightT = TypeVar("SightT")
+PreparedT = TypeVar("PreparedT")
 SightT_contra = TypeVar("SightT_contra", contravariant=True)
 EvaluationT = TypeVar("EvaluationT", bound=EnergyAt)
 
@@ -96,12 +96,12 @@ class Iterations(Protocol[StateT, EvaluationT]):
 class Stage(Protocol[StateT, SightT_contra, EvaluationT, FiguresT_co]):
     """A `Stage` of all problems has begun: everything is fixed that must not change while costs compare."""
 
-    def start(self, sight: SightT_contra) -> tuple[Iterations[StateT, EvaluationT], EvaluationT]:
+    def start(self, prepared: SightT_contra) -> tuple[Iterations[StateT, EvaluationT], EvaluationT]:
         """The iterations, and the evaluation of the state where they begin."""
         ...
 
-    def figures(self, sight: SightT_contra) -> FiguresT_co:
-        """The figures of a state from `look`."""
+    def figures(self, prepared: SightT_contra) -> FiguresT_co:
+        """The figures of a state from `prepare`."""
         ...
 
     def linearise_differentiably(self, state: StateT) -> EvaluationT:
@@ -121,7 +121,7 @@ class Stage(Protocol[StateT, SightT_contra, EvaluationT, FiguresT_co]):
         ...
 
 
-class Problem(Protocol[StateT, SightT, EvaluationT, FiguresT_co]):
+class Problem(Protocol[StateT, PreparedT, EvaluationT, FiguresT_co]):
     """A `Problem` is a batch of B problems, by themselves or in groups that share unknowns."""
 
     @property
@@ -131,12 +131,12 @@ class Problem(Protocol[StateT, SightT, EvaluationT, FiguresT_co]):
 
     def stages(self) -> Sequence[StageConfig]: ...
 
-    def look(self, state: StateT) -> SightT:
+    def prepare(self, state: StateT) -> PreparedT:
         """The preparation of a state, with which stages and figures begin."""
         ...
 
-    def begin(self, stage: int, sight: SightT) -> Stage[StateT, SightT, EvaluationT, FiguresT_co]:
-        """The stage of that number, which begins at a state from `look`; -1 is the last stage."""
+    def begin(self, stage: int, prepared: PreparedT) -> Stage[StateT, PreparedT, EvaluationT, FiguresT_co]:
+        """The stage of that number, which begins at a state from `prepare`; -1 is the last stage."""
         ...
 
     def of(self, problems: Chosen) -> Self:

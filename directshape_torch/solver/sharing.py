@@ -108,8 +108,8 @@ class Groups(Sharing):
         longest = max(standing, default=-1) + 1
         rows = [[group.index(name)] * longest for name in numbers]
         filled = [[False] * longest for _ in numbers]
-        for row, (name, where) in enumerate(zip(group, standing, strict=True)):
-            rows[numbers[name]][where], filled[numbers[name]][where] = row, True
+        for row, (name, at) in enumerate(zip(group, standing, strict=True)):
+            rows[numbers[name]][at], filled[numbers[name]][at] = row, True
         index = partial(torch.tensor, device=own.device, dtype=torch.long)
         first = len(own) * index(standing)[:, None]
         column = first.new_empty(len(group), len(own) + len(shared) + len(of_next))
@@ -130,7 +130,7 @@ class Groups(Sharing):
         )
 
     @property
-    def everybody(self) -> Tensor:
+    def all_members(self) -> Tensor:
         """The members (B,) where all problems count."""
         return torch.ones_like(self.of_problem, dtype=torch.bool)
 
@@ -154,7 +154,7 @@ class Groups(Sharing):
         return self._of_problems(step, members & solvable[self.of_problem])
 
     def newton_step(self, J: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        step, solvable = newton_step(*self._system(J.detach(), gradient, self.everybody))
+        step, solvable = newton_step(*self._system(J.detach(), gradient, self.all_members))
         return self._of_problems(step, solvable[self.of_problem])
 
     def with_others(self, information: Tensor, members: Tensor) -> Tensor:
@@ -211,7 +211,7 @@ def _inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
     return damped_solution(matrix, identity, torch.zeros_like(matrix[:, 0, 0]))
 
 
-def said_of_shared(
+def schur_complement(
     matrix: Tensor,  # (B, D, D)
     gradient: Tensor,  # (B, D)
     own: Tensor,

@@ -17,10 +17,10 @@ from directshape_torch.numerics.tables import Chosen, declared, is_table, of
 from directshape_torch.rows import Blocks
 from directshape_torch.shape.field import Field
 from directshape_torch.state.unknowns import CODE, OFFSET, POSE, State
-from directshape_torch.terms.term import AnyTerm, Linear, Sight, Term, WhereT, linear_of, part_of
+from directshape_torch.terms.term import AnchorT, AnyTerm, Linear, Prepared, Term, linear_of, part_of
 
 _OWN = ("names", "blocks", "block_weight", "information", "row_weight", "residual", "norm")
-_DEFAULTS = ("sees", "is_prior", "column", "begin", "moving", "where", "linear")
+_DEFAULTS = ("sees", "is_prior", "column", "begin", "changing_rows", "anchor", "linear")
 # Matrices and gradients may differ by this share of their largest entry: by more than rounding, less than 1 cm causes.
 _ROUNDING = 1e-4
 _BLOCKS = POSE, CODE, OFFSET
@@ -46,7 +46,7 @@ def check_members(term: AnyTerm) -> None:
 
 @torch.no_grad()
 def check_term(
-    term: AnyTerm, stage: StageConfig, sight: Sight, taken: Collection[str], field_at: Callable[[Tensor], Field]
+    term: AnyTerm, stage: StageConfig, prepared: Prepared, taken: Collection[str], field_at: Callable[[Tensor], Field]
 ) -> None:
     """Raise `InputError` unless all values of a term at a state have the types and shapes that `Term` requires.
 
@@ -55,37 +55,39 @@ def check_term(
     Args:
         term: term of B cars before any stage, with all members (`check_members`).
         stage: first stage.
-        sight: what rays see at any state of these cars.
+        prepared: any state of these cars.
         taken: names of other terms.
         field_at: the shapes of codes (B, K).
     """
     names, called = term.names, f"extra term {term.names[0]!r}"
     if len(set(names)) < len(names) or not set(names).isdisjoint(taken):
         raise InputError(f"{called}: names", f"names that no other column has ({', '.join(taken)})", repr(names))
-    num_cars = len(sight.state.code)
+    num_cars = len(prepared.state.code)
     _check_fields(called, term, {"B": num_cars})
-    begun = term.begin(stage, sight)
+    begun = term.begin(stage, prepared)
     _check_rows(f"{called} after begin(...)", begun, num_cars)
-    _check_linear(f"{called}: linear(...)", begun, begun.where(sight), sight.field, sight.state)
-    moving, where, resting = begun.moving(sight, False)
-    _check_rows(f"{called} after moving(...)", moving, num_cars)
-    _check_linear(f"{called} after moving(...): linear(...)", moving, where, sight.field, sight.state)
-    check_shape(f"{called}: the cost of moving(...)", resting, (num_cars, len(names)), "one for each car and name")
-    before = car_products(moving, sight.field, sight.state, where)
+    _check_linear(f"{called}: linear(...)", begun, begun.anchor(prepared), prepared.field, prepared.state)
+    moving, anchor, resting = begun.changing_rows(prepared, False)
+    _check_rows(f"{called} after changing_rows(...)", moving, num_cars)
+    _check_linear(f"{called} after changing_rows(...): linear(...)", moving, anchor, prepared.field, prepared.state)
+    check_shape(
+        f"{called}: the cost of changing_rows(...)", resting, (num_cars, len(names)), "one for each car and name"
+    )
+    before = car_products(moving, prepared.field, prepared.state, anchor)
     # The remaining cars are every other car, the last car, or none; in the first two cases all cars get new numbers.
     for numbers in dict.fromkeys((tuple(range(1, num_cars, 2)), tuple(range(num_cars))[-1:], ())):
         if len(numbers) < num_cars:
-            keep = torch.zeros(num_cars, dtype=torch.bool, device=sight.state.code.device)
+            keep = torch.zeros(num_cars, dtype=torch.bool, device=prepared.state.code.device)
             keep[list(numbers)] = True
-            left, few = f"{called} after of(cars)", of(sight.state, Chosen(keep, numbers))
+            left, few = f"{called} after of(cars)", of(prepared.state, Chosen(keep, numbers))
             with named_errors(left, len(numbers)):
-                now = _products_of(Chosen(keep, numbers), moving, where, few, field_at(few.code))
+                now = _products_of(Chosen(keep, numbers), moving, anchor, few, field_at(few.code))
             check_same(left, now, before, numbers)
 
 
-def car_products(term: Term[WhereT], field: Field, state: State, where: WhereT) -> Tensor:
+def car_products(term: Term[AnchorT], field: Field, state: State, anchor: AnchorT) -> Tensor:
     """Sums of a term for its cars (B, D + 1, D): the Gauss-Newton matrix, and the gradient as its last row."""
-    products = part_of(term, linear_of(term, field, state, where), fisher=False).products
+    products = part_of(term, linear_of(term, field, state, anchor), fisher=False).products
     sums = products.new_zeros(len(state.code), *products.shape[1:])
     return sums.index_add(0, term.blocks.owner, products * term.block_weight[:, None, None])
 
@@ -102,10 +104,10 @@ def check_same(called: str, now: Tensor, before: Tensor, numbers: Sequence[int])
         raise InputError(called, "the rows that each car had before", f"others of car {car}", _LEAVING)
 
 
-def _products_of(cars: Chosen, term: Term[WhereT], where: WhereT, few: State, field: Field) -> Tensor:
+def _products_of(cars: Chosen, term: Term[AnchorT], anchor: AnchorT, few: State, field: Field) -> Tensor:
     """The sums of some cars, computed as in an iteration after the other cars have left."""
     blocks = term.blocks.kept(cars)
-    return car_products(term.of(cars), field, few, map_tensors(lambda x: x.index_select(-2, blocks), where))
+    return car_products(term.of(cars), field, few, map_tensors(lambda x: x.index_select(-2, blocks), anchor))
 
 
 @contextmanager
@@ -171,10 +173,10 @@ def _check_numbers(called: str, numbers: Tensor, count: int, of_what: str) -> No
         raise InputError(called, f"numbers of the {count} {of_what}", got, "number the cars of this batch from 0")
 
 
-def _check_linear(called: str, term: Term[WhereT], where: WhereT, field: Field, state: State) -> None:
+def _check_linear(called: str, term: Term[AnchorT], anchor: AnchorT, field: Field, state: State) -> None:
     """Check that the factors of the Jacobian, the residuals and the norms fit the rows."""
     with named_errors(called, len(state.code)):
-        at = term.linear(field, state, where)
+        at = term.linear(field, state, anchor)
     if not isinstance(at, Linear):
         raise InputError(called, "a Linear", type(at).__name__)
     of_rows = tuple(term.row_weight.shape)
@@ -185,7 +187,7 @@ def _check_linear(called: str, term: Term[WhereT], where: WhereT, field: Field, 
     by_seen = (*of_rows[:2], size)
     check_shape(f"{called}.J_inner_state", at.J_inner_state, by_seen, f"by {seen}, without the residual's axis")
     with named_errors(called.replace("linear", "residual"), len(state.code)):
-        again = term.residual(field, state, at.where)
+        again = term.residual(field, state, at.anchor)
     check_shape(f"{called.replace('linear', 'residual')}", again, of_rows, "those of linear(...)")
     for name, values in term.norm(at.residual)._asdict().items():
         check_shape(f"{called.replace('linear', 'norm')}.{name}", values, of_rows, "one for each residual")

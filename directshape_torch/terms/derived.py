@@ -16,19 +16,19 @@ from directshape_torch.shape.field import Field
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.state.unknowns import State
 from directshape_torch.terms.robust import RobustValue
-from directshape_torch.terms.term import AnyTerm, Linear, Sight, Term, WhereT, by_autograd
+from directshape_torch.terms.term import AnchorT, AnyTerm, Linear, Prepared, Term, by_autograd
 
 
-def with_jacobian(term: Term[WhereT], prior: ShapePrior) -> Term[WhereT]:
+def with_jacobian(term: Term[AnchorT], prior: ShapePrior) -> Term[AnchorT]:
     """The term itself if it has its own `linear`, else a term that differentiates its `residual`."""
     return Derived(term, prior) if inspect.getattr_static(term, "linear") is vars(Term)["linear"] else term
 
 
 @dataclass(frozen=True)
-class Derived(Term[WhereT]):
+class Derived(Term[AnchorT]):
     """A `Derived` gives `linear` to a term that lacks it and whose rows have one residual each."""
 
-    term: Term[WhereT]
+    term: Term[AnchorT]
     prior: ShapePrior  # shape prior from which the field of a moved state is made
 
     @property
@@ -63,26 +63,26 @@ class Derived(Term[WhereT]):
     def row_weight(self) -> Tensor:
         return self.term.row_weight
 
-    def begin(self, stage: StageConfig, sight: Sight) -> AnyTerm:
-        return with_jacobian(self.term.begin(stage, sight), self.prior)
+    def begin(self, stage: StageConfig, prepared: Prepared) -> AnyTerm:
+        return with_jacobian(self.term.begin(stage, prepared), self.prior)
 
-    def moving(self, sight: Sight, after_wider: bool) -> tuple[Self, WhereT, Tensor]:
-        term, where, resting = self.term.moving(sight, after_wider)
-        return replace(self, term=term), where, resting
+    def changing_rows(self, prepared: Prepared, after_wider: bool) -> tuple[Self, AnchorT, Tensor]:
+        term, anchor, resting = self.term.changing_rows(prepared, after_wider)
+        return replace(self, term=term), anchor, resting
 
-    def where(self, sight: Sight) -> WhereT:
-        return self.term.where(sight)
+    def anchor(self, prepared: Prepared) -> AnchorT:
+        return self.term.anchor(prepared)
 
-    def linear(self, field: Field, state: State, where: WhereT) -> Linear[WhereT]:
-        ((residual, J),) = by_autograd([self.term], self.prior, state, [where])
+    def linear(self, field: Field, state: State, anchor: AnchorT) -> Linear[AnchorT]:
+        ((residual, J),) = by_autograd([self.term], self.prior, state, [anchor])
         if residual.shape[-1:] != (1,):
             cure = "write linear(...) by hand, which may give several residuals of a row one inner scalar"
             called = f"extra term {self.names[0]!r}: residual(...)"
             raise InputError(called, "one residual a row, shape (M, R, 1)", f"{tuple(residual.shape)}", cure)
-        return Linear(residual, torch.ones_like(residual), J[:, :, 0], where)
+        return Linear(residual, torch.ones_like(residual), J[:, :, 0], anchor)
 
-    def residual(self, field: Field, state: State, where: WhereT) -> Tensor:
-        return self.term.residual(field, state, where)
+    def residual(self, field: Field, state: State, anchor: AnchorT) -> Tensor:
+        return self.term.residual(field, state, anchor)
 
     def norm(self, residual: Tensor) -> RobustValue:
         return self.term.norm(residual)

@@ -37,7 +37,7 @@ from directshape_torch.terms.photometric_rows import (
     warped_pixels,
 )
 from directshape_torch.terms.silhouette import sdf_state_jacobian
-from directshape_torch.terms.term import Linear, Sight, Term
+from directshape_torch.terms.term import Linear, Prepared, Term
 
 Brightness = Literal["none", "gain", "affine"]
 
@@ -56,20 +56,20 @@ class PixelSet(NamedTuple):
 
     rows: PhotometricRows
     blocks: Blocks
-    sight_blocks: Annotated[Tensor, Dense("B", kind="index")]  # number of blocks of a `Sight` in the left image
+    prepared_blocks: Annotated[Tensor, Dense("B", kind="index")]  # number of blocks of a `Prepared` in the left image
     place_in_car: Annotated[Tensor, Dense("M", BLOCK, kind="index")]  # place of each pixel in these blocks of its car
     filled: Annotated[Tensor, Dense("M", BLOCK, kind="flags")]  # whether the place holds a pixel
     weight: Annotated[Tensor, Dense("M")]  # float64, lambda over the number of neighbours of the car
     support: Annotated[Tensor, Dense("B")]  # number of pixels of the car, float64
 
     @property
-    def sight_place(self) -> Tensor:
-        """Place (M, 64) of each pixel among the left places of a `Sight` of these cars."""
-        return self.place_in_car + first_places(self.sight_blocks, self.blocks.owner)
+    def prepared_place(self) -> Tensor:
+        """Place (M, 64) of each pixel among the left places of a `Prepared` of these cars."""
+        return self.place_in_car + first_places(self.prepared_blocks, self.blocks.owner)
 
 
 class Surface(NamedTuple):
-    """A `Surface` is where the rows of this term look: the surface under the pixels."""
+    """A `Surface` is the anchor of this term: the surface under the pixels."""
 
     points_obj: Annotated[Tensor, Dense(3, "M", BLOCK)]  # metres, next to the surface
     normal_obj: Annotated[Tensor, Dense(3, "M", BLOCK)]  # gradient of the signed distance at `points_obj`
@@ -89,9 +89,9 @@ class PhotometricEvidence(Table):
 
     names = ("photometric",)
 
-    def begin(self, stage: StageConfig, sight: Sight) -> Photometric:
+    def begin(self, stage: StageConfig, prepared: Prepared) -> Photometric:
         left = self.left
-        rays, hits = left.rays.in_objects(sight.state.T_obj_cam), sight.hits
+        rays, hits = left.rays.in_objects(prepared.state.T_obj_cam), prepared.hits
         on_surface = (hits.found & ~is_grazing(hits.normal_obj, rays.direction_obj)).flatten()
         candidates = on_surface.index_select(0, left.packed.places)
         if self.config.pixel_set == "hit_and_mask":
@@ -100,14 +100,14 @@ class PhotometricEvidence(Table):
         packed = Rows.of_sorted(left.pixels.object_index[chosen], len(self.cars))
         row = chosen[packed.row]
         place = left.packed.places[row]
-        sight_blocks = occurrences(left.packed.blocks.owner, len(self.cars))
+        prepared_blocks = occurrences(left.packed.blocks.owner, len(self.cars))
         rows = left.rows(self.config, self.cars, packed, row, stage.image_level)
-        depth = sight.hits.depth.flatten()[place]
+        depth = prepared.hits.depth.flatten()[place]
         if not nothing_is_differentiated():
             # The matched brightness depends on the surface and must be differentiable by it.
-            rays = rows.rays.in_objects(sight.state.T_obj_cam)
-            depth = surface_depth(sight.field, packed.blocks.owner, rays, depth, packed.filled)
-        warped = warped_pixels(rows, warped_depth(self.cars, depth, sight.state, packed.blocks.owner)[0])
+            rays = rows.rays.in_objects(prepared.state.T_obj_cam)
+            depth = surface_depth(prepared.field, packed.blocks.owner, rays, depth, packed.filled)
+        warped = warped_pixels(rows, warped_depth(self.cars, depth, prepared.state, packed.blocks.owner)[0])
         right, counted = warped.at.value, (packed.filled & warped.is_comparable(rows.right)).to(depth.dtype)
         neighbours, owner = counted * rows.neighbour_weight, packed.blocks.owner
         form = self.config.brightness
@@ -116,8 +116,8 @@ class PhotometricEvidence(Table):
         total, support = CarSums.of(owner, len(self.cars)).sum(per_block).unbind(dim=1)
         rows = rows._replace(intensity_left=matched, pixel_weight=rows.pixel_weight * counted)
         weight = (self.config.weight / total.clamp_min(1))[owner]
-        place_in_car = place - first_places(sight_blocks, owner)
-        fixed = PixelSet(rows, packed.blocks, sight_blocks, place_in_car, packed.filled, weight, support)
+        place_in_car = place - first_places(prepared_blocks, owner)
+        fixed = PixelSet(rows, packed.blocks, prepared_blocks, place_in_car, packed.filled, weight, support)
         return Photometric(self.config, self.cars, fixed)
 
 
@@ -151,15 +151,17 @@ class Photometric(Term[Surface]):
         rows = self.pixel_set.rows
         return rows.pixel_weight[..., None] * rows.neighbour_weight.movedim(0, -1)
 
-    def where(self, sight: Sight) -> Surface:
-        place = self.pixel_set.sight_place
-        points, normal = (x.flatten(1)[:, place] for x in (sight.hits.points_obj, sight.hits.normal_obj))
-        depth, found = (x.flatten()[place] for x in (sight.hits.depth, sight.hits.found))
-        return Surface(points, normal, warped_depth(self.cars, depth, sight.state, self.blocks.owner)[0], found, found)
+    def anchor(self, prepared: Prepared) -> Surface:
+        place = self.pixel_set.prepared_place
+        points, normal = (x.flatten(1)[:, place] for x in (prepared.hits.points_obj, prepared.hits.normal_obj))
+        depth, found = (x.flatten()[place] for x in (prepared.hits.depth, prepared.hits.found))
+        return Surface(
+            points, normal, warped_depth(self.cars, depth, prepared.state, self.blocks.owner)[0], found, found
+        )
 
-    def linear(self, field: Field, state: State, where: Surface) -> Linear[Surface]:
+    def linear(self, field: Field, state: State, anchor: Surface) -> Linear[Surface]:
         rows, owner = self.pixel_set.rows, self.blocks.owner
-        surface = near_surface(rows.rays, field, state, where)
+        surface = near_surface(rows.rays, field, state, anchor)
         found, J_depth_state = surface.found, surface.J_depth_state
         depth, ratio = warped_depth(self.cars, surface.depth, state, owner)
         if ratio is not None:
@@ -169,14 +171,14 @@ class Photometric(Term[Surface]):
         usable = found & compare.comparable
         residual = torch.where(usable[..., None], compare.residual, self.config.lost_grey_levels)
         J = torch.where(usable[..., None], compare.J_residual_depth, 0.0)
-        return Linear(residual, J, J_depth_state, surface.seen(where, depth, usable))
+        return Linear(residual, J, J_depth_state, surface.seen(anchor, depth, usable))
 
-    def residual(self, field: Field, state: State, where: Surface) -> Tensor:
+    def residual(self, field: Field, state: State, anchor: Surface) -> Tensor:
         rows = self.pixel_set.rows
-        depth = depth_of(rows.rays.in_objects(state.T_obj_cam), rows.rays.owner, field, where)
+        depth = depth_of(rows.rays.in_objects(state.T_obj_cam), rows.rays.owner, field, anchor)
         depth, _ = warped_depth(self.cars, depth, state, rows.rays.owner)
         residual, _ = residuals_at(rows, depth)
-        return torch.where(where.usable[..., None], residual, self.config.lost_grey_levels)
+        return torch.where(anchor.usable[..., None], residual, self.config.lost_grey_levels)
 
     def norm(self, residual: Tensor) -> robust.RobustValue:
         return robust.huber(residual, self.config.huber_grey_levels)
@@ -211,17 +213,17 @@ class NearSurface(NamedTuple):
     J_depth_state: Tensor  # (M, 64, 6 + K), zero where `found` is false
 
     def seen(self, before: Surface, depth: Tensor, usable: Tensor) -> Surface:
-        """Where later states look; a pixel without a surface keeps its last hit."""
+        """The anchor of later states; a pixel without a surface keeps its last hit."""
         points, normal = self.points_obj.detach(), self.normal_obj.detach()
         points = torch.where(self.found, points, before.points_obj)
         normal = torch.where(self.found, normal, before.normal_obj)
         return Surface(points, normal, depth.detach(), self.found, usable)
 
 
-def near_surface(rays_cam: Rays, field: Field, state: State, where: Surface) -> NearSurface:
+def near_surface(rays_cam: Rays, field: Field, state: State, anchor: Surface) -> NearSurface:
     """The surface that rays meet, with the derivative of its depth; differentiable with gradients enabled."""
     rays, owner = rays_cam.in_objects(state.T_obj_cam), rays_cam.owner
-    near = tracked_depth(field, rays_cam, rays, Hits(*where[:2], where.usable, where.depth))
+    near = tracked_depth(field, rays_cam, rays, Hits(*anchor[:2], anchor.usable, anchor.depth))
     constant = nothing_is_differentiated()
     if not constant:
         is_near = field.sdf(rays.at(near), owner).detach().abs() < NEAR_SURFACE_M
@@ -237,12 +239,12 @@ def near_surface(rays_cam: Rays, field: Field, state: State, where: Surface) -> 
     return NearSurface(rays, points, at.gradient, depth, found, J_depth_state)
 
 
-def depth_of(rays: ObjectRays, owner: Tensor, field: Field, where: Surface) -> Tensor:
-    """Depth (M, 64) by one Newton step from `where`, with derivatives equal to the ones of `near_surface`."""
-    near = rays.depth_next_to(where.points_obj).detach()
-    slope = (where.normal_obj * rays.direction_obj).sum(0).detach()
-    step = field.sdf(rays.at(near), owner) / torch.where(where.usable, slope, -1.0)
-    return near - torch.where(where.usable, step, torch.zeros_like(step))
+def depth_of(rays: ObjectRays, owner: Tensor, field: Field, anchor: Surface) -> Tensor:
+    """Depth (M, 64) by one Newton step from `anchor`, with derivatives equal to the ones of `near_surface`."""
+    near = rays.depth_next_to(anchor.points_obj).detach()
+    slope = (anchor.normal_obj * rays.direction_obj).sum(0).detach()
+    step = field.sdf(rays.at(near), owner) / torch.where(anchor.usable, slope, -1.0)
+    return near - torch.where(anchor.usable, step, torch.zeros_like(step))
 
 
 def is_grazing(normal_obj: Tensor, direction_obj: Tensor) -> Tensor:

@@ -76,14 +76,14 @@ class LeftPixels(Table):
     """`LeftPixels` holds all packed pixels of the left image and both images; pixel sets are made from it."""
 
     pixels: PixelSamples  # P packed pixels
-    packed: Rows  # how the pixels fill the blocks of a `Sight`
+    packed: Rows  # how the pixels fill the blocks of a `Prepared`
     pyramid: tuple[GreyPair, ...]  # both images at every level that a stage asks for
     hidden_right: OcclusionMap | None  # where nearer instances cover the right image; None: nowhere
     mask_left: MaskCrops  # masks of the detections of the call
 
     @property
     def rays(self) -> Rays:
-        """The rays of the blocks of a `Sight`."""
+        """The rays of the blocks of a `Prepared`."""
         return Rays.of_rows(self.packed, self.pixels.origin_cam, self.pixels.ray_cam)
 
     def rows(

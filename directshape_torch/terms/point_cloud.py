@@ -22,11 +22,11 @@ from directshape_torch.shape.field import Field
 from directshape_torch.state.unknowns import State
 from directshape_torch.terms import robust
 from directshape_torch.terms.silhouette import sdf_state_jacobian
-from directshape_torch.terms.term import Linear, Nowhere, Term
+from directshape_torch.terms.term import Linear, NoAnchor, Term
 
 
 @dataclass(frozen=True)
-class PointCloud(Term[Nowhere]):
+class PointCloud(Term[NoAnchor]):
     """A `PointCloud` is built with `of_points`; its points stay fixed for the whole refinement."""
 
     name: str  # name of the term
@@ -63,13 +63,13 @@ class PointCloud(Term[Nowhere]):
     def row_weight(self) -> Tensor:
         return self.filled[..., None]
 
-    def linear(self, field: Field, state: State, where: Nowhere) -> Linear[Nowhere]:
+    def linear(self, field: Field, state: State, anchor: NoAnchor) -> Linear[NoAnchor]:
         points = self._points_obj(state)
         at = field.derivatives(points, self.points_cam.owner, nothing_is_differentiated())
         residual = at.value[..., None]
-        return Linear(residual, torch.ones_like(residual), sdf_state_jacobian(points, at.gradient, at), where)
+        return Linear(residual, torch.ones_like(residual), sdf_state_jacobian(points, at.gradient, at), anchor)
 
-    def residual(self, field: Field, state: State, where: Nowhere) -> Tensor:
+    def residual(self, field: Field, state: State, anchor: NoAnchor) -> Tensor:
         return field.sdf(self._points_obj(state), self.points_cam.owner)[..., None]
 
     def norm(self, residual: Tensor) -> robust.RobustValue:

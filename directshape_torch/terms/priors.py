@@ -26,7 +26,7 @@ from directshape_torch.shape.shape_prior import DimensionsDerivative, ShapePrior
 from directshape_torch.state.cars import CarBatch
 from directshape_torch.state.unknowns import CODE, OFFSET, POSE, State
 from directshape_torch.terms import robust
-from directshape_torch.terms.term import AnyTerm, Linear, Nowhere, Term
+from directshape_torch.terms.term import AnyTerm, Linear, NoAnchor, Term
 
 RIG_WEIGHT = 0.2
 """The offset of the disparity, in standard deviations, has the weight of the detector's pose."""
@@ -40,7 +40,7 @@ class PriorResidual(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PriorTerm(Term[Nowhere]):
+class PriorTerm(Term[NoAnchor]):
     """A `PriorTerm` costs `weight * sum_i r_i^2 / 2` for a residual of the state; each car has one block of R rows.
 
     Raises:
@@ -114,13 +114,13 @@ class PriorTerm(Term[Nowhere]):
         J, value = torch.func.jacfwd(residual, has_aux=True)(zero)
         return PriorResidual(value, J)
 
-    def linear(self, field: Field, state: State, where: Nowhere) -> Linear[Nowhere]:
+    def linear(self, field: Field, state: State, anchor: NoAnchor) -> Linear[NoAnchor]:
         at = self._at(state)
         at = self._derived(state) if isinstance(at, Tensor) else at
         residual = at.residual.to(torch.float64)[..., None]
-        return Linear(residual, torch.ones_like(residual), at.J_residual_state.to(torch.float64), where)
+        return Linear(residual, torch.ones_like(residual), at.J_residual_state.to(torch.float64), anchor)
 
-    def residual(self, field: Field, state: State, where: Nowhere) -> Tensor:
+    def residual(self, field: Field, state: State, anchor: NoAnchor) -> Tensor:
         at = self._at(state)
         return (at if isinstance(at, Tensor) else at.residual).to(torch.float64)[..., None]
 

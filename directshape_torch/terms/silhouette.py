@@ -37,7 +37,7 @@ from directshape_torch.terms.depth import (
     sample_depths,
     tracked_closest,
 )
-from directshape_torch.terms.term import Linear, Sight, Term, WhereT
+from directshape_torch.terms.term import AnchorT, Linear, Prepared, Term
 
 # Zeta stays within these bounds, per metre.
 ZETA_BOUNDS = (4.0, 400.0)
@@ -141,14 +141,14 @@ class SilhouetteEvidence(Table):
 
     names = ("silhouette_left", "silhouette_right")
 
-    def begin(self, stage: StageConfig, sight: Sight) -> Silhouettes | SilhouetteProducts:
+    def begin(self, stage: StageConfig, prepared: Prepared) -> Silhouettes | SilhouetteProducts:
         form = SilhouetteProducts if self.config.form == "product" else Silhouettes
         zeta = contour_zeta(self.cars, stage)[self.rows.rays.owner][:, None]
         return form(self.config, self.cars, self.rows, self.bounds_obj, zeta)
 
 
 @dataclass(frozen=True)
-class OfMasks(Term[WhereT]):
+class OfMasks(Term[AnchorT]):
     """`OfMasks` is what the terms of both forms of the projection have in common, for both images in a stage."""
 
     config: SilhouetteConfig  # weight and forms
@@ -186,28 +186,28 @@ class OfMasks(Term[WhereT]):
 class Silhouettes(OfMasks[Closest]):
     """`Silhouettes` is the term of both images in a stage, with the projection by closest approach."""
 
-    def moving(self, sight: Sight, after_wider: bool) -> tuple[Self, Closest, Tensor]:
+    def changing_rows(self, prepared: Prepared, after_wider: bool) -> tuple[Self, Closest, Tensor]:
         """Keep the rays that are or may come near the contour; the other rays stay certain during the next steps."""
-        distance = self._least_distance(sight)
+        distance = self._least_distance(prepared)
         margin = _IN_PLAY_MARGIN_M * self.zeta
         if after_wider:
             margin = margin.clamp_max(_MARGIN_EXPONENT_AFTER_WIDER)
-        in_play = (distance.abs() * self.zeta < IN_PLAY_EXPONENT + margin) | ~sight.closest.crosses
+        in_play = (distance.abs() * self.zeta < IN_PLAY_EXPONENT + margin) | ~prepared.closest.crosses
         resting = torch.where(in_play, torch.zeros_like(distance), self.rows.filled)
         rows, places = self.rows.packed_anew(in_play & (self.rows.filled > 0))
-        cost = (resting * self._of_distance(distance, sight.closest.crosses)[0]).to(torch.float64).sum(dim=1)
+        cost = (resting * self._of_distance(distance, prepared.closest.crosses)[0]).to(torch.float64).sum(dim=1)
         of_side = self.rows.rays.owner + len(self.cars) * self.rows.side
         at_rest = CarSums.of(of_side, 2 * len(self.cars)).sum(cost, self.rows.weight).view(2, -1).T
         zeta = self.zeta[places[:, 0] // self.rows.filled.shape[1]]
-        where = Closest(*(x.flatten(-2)[..., places] for x in sight.closest))
-        return replace(self, rows=rows, zeta=zeta), where, at_rest
+        anchor = Closest(*(x.flatten(-2)[..., places] for x in prepared.closest))
+        return replace(self, rows=rows, zeta=zeta), anchor, at_rest
 
-    def where(self, sight: Sight) -> Closest:
-        return sight.closest
+    def anchor(self, prepared: Prepared) -> Closest:
+        return prepared.closest
 
-    def linear(self, field: Field, state: State, where: Closest) -> Linear[Closest]:
+    def linear(self, field: Field, state: State, anchor: Closest) -> Linear[Closest]:
         rays = self.rows.rays.in_objects(state.T_obj_cam)
-        now = tracked_closest(field, self.rows.rays, rays, self.bounds_obj, where)
+        now = tracked_closest(field, self.rows.rays, rays, self.bounds_obj, anchor)
         constant = nothing_is_differentiated()
         depth = now.depth if constant else attached_closest_depth(field, self.rows.rays.owner, rays, now)
         points = rays.at(depth)
@@ -216,19 +216,19 @@ class Silhouettes(OfMasks[Closest]):
         residual, J_residual_sdf = self._of_distance(at.value, now.crosses)
         return Linear(residual[..., None], J_residual_sdf[..., None], sdf_state_jacobian(points, gradient, at), now)
 
-    def residual(self, field: Field, state: State, where: Closest) -> Tensor:
+    def residual(self, field: Field, state: State, anchor: Closest) -> Tensor:
         rays = self.rows.rays.in_objects(state.T_obj_cam)
-        points = rays.at(where.depth)
-        across = (where.face_obj * rays.direction_obj).sum(0).detach()
+        points = rays.at(anchor.depth)
+        across = (anchor.face_obj * rays.direction_obj).sum(0).detach()
         is_kink = across != 0
         # At a kink the point stays on its face; at a smooth minimum the depth has no first-order effect.
-        off_face = (where.face_obj * (points - where.points_obj)).sum(0)
-        depth = where.depth - torch.where(is_kink, off_face / torch.where(is_kink, across, 1.0), 0.0)
+        off_face = (anchor.face_obj * (points - anchor.points_obj)).sum(0)
+        depth = anchor.depth - torch.where(is_kink, off_face / torch.where(is_kink, across, 1.0), 0.0)
         sdf = field.sdf(rays.at(depth), self.rows.rays.owner)
-        return self._of_distance(sdf, where.crosses)[0][..., None]
+        return self._of_distance(sdf, anchor.crosses)[0][..., None]
 
-    def _least_distance(self, sight: Sight) -> Tensor:
-        return sight.field.sdf(sight.closest.points_obj, self.rows.rays.owner)
+    def _least_distance(self, prepared: Prepared) -> Tensor:
+        return prepared.field.sdf(prepared.closest.points_obj, self.rows.rays.owner)
 
     def _of_distance(self, sdf: Tensor, crosses: Tensor) -> tuple[Tensor, Tensor]:
         """Residual (M, R) of least distances, and its derivative; rays outside the bounds have a constant residual."""
@@ -292,12 +292,12 @@ class SilhouetteProducts(OfMasks[Samples]):
     shares of its interval with the prior's bounds, and are constants of a linearisation.
     """
 
-    def where(self, sight: Sight) -> Samples:
-        rays = self.rows.rays.in_objects(sight.state.T_obj_cam)
+    def anchor(self, prepared: Prepared) -> Samples:
+        rays = self.rows.rays.in_objects(prepared.state.T_obj_cam)
         depths, crosses = sample_depths(rays, self.bounds_obj, self.config.samples_per_ray)
         return Samples(depths.detach(), crosses)
 
-    def linear(self, field: Field, state: State, where: Samples) -> Linear[Samples]:
+    def linear(self, field: Field, state: State, anchor: Samples) -> Linear[Samples]:
         owner = self.rows.rays.owner
         rays = self.rows.rays.in_objects(state.T_obj_cam)
         num_samples, constant = self.config.samples_per_ray, nothing_is_differentiated()
@@ -319,11 +319,11 @@ class SilhouetteProducts(OfMasks[Samples]):
         residual = torch.where(crosses, residual, self.rows.residual_of_a_miss())
         return Linear(residual[..., None], torch.ones_like(residual)[..., None], J, Samples(depths.detach(), crosses))
 
-    def residual(self, field: Field, state: State, where: Samples) -> Tensor:
+    def residual(self, field: Field, state: State, anchor: Samples) -> Tensor:
         rays = self.rows.rays.in_objects(state.T_obj_cam)
-        sdf = field.sdf(rays.at(where.depths), self.rows.rays.owner)
+        sdf = field.sdf(rays.at(anchor.depths), self.rows.rays.owner)
         residual, _ = product_residual(sdf, self.zeta, self.rows.foreground)
-        return torch.where(where.crosses, residual, self.rows.residual_of_a_miss())[..., None]
+        return torch.where(anchor.crosses, residual, self.rows.residual_of_a_miss())[..., None]
 
 
 def product_residual(

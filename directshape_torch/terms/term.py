@@ -24,13 +24,13 @@ from directshape_torch.state.unknowns import CODE, POSE, State
 from directshape_torch.terms.depth import Closest, Hits
 from directshape_torch.terms.robust import RobustValue
 
-# Where the rows of a term look is a constant tensor (..., M, R), a named tuple of these, or `Nowhere`.
-WhereT = TypeVar("WhereT", bound=Tensor | tuple[Tensor, ...])
-Nowhere: TypeAlias = tuple[()]
+# The anchor of a term is constant: a tensor (..., M, R), a named tuple of these, or `NoAnchor`.
+AnchorT = TypeVar("AnchorT", bound=Tensor | tuple[Tensor, ...])
+NoAnchor: TypeAlias = tuple[()]
 
 
-class Sight(NamedTuple):
-    """A `Sight` is what the rays of all pixels see at a state, without knowledge of a nearby state; it is constant."""
+class Prepared(NamedTuple):
+    """A `Prepared` is a state with what the rays of all pixels hit there, whatever other states are; it is constant."""
 
     state: State
     field: Field
@@ -38,14 +38,14 @@ class Sight(NamedTuple):
     hits: Hits  # hits of the rays of the left image
 
 
-class Linear(NamedTuple, Generic[WhereT]):
+class Linear(NamedTuple, Generic[AnchorT]):
     """A `Linear` holds residuals of a term, N for each row, with their Jacobian in factors."""
 
     residual: Tensor  # (M, R, N)
     J_residual_inner: Tensor  # (M, R, N)
     # (M, R, S) by the unknowns that the term sees, block after block, or (M, R, D) by all unknowns
     J_inner_state: Tensor
-    where: WhereT  # the points at which the residuals were taken
+    anchor: AnchorT  # the points at which the residuals were taken
 
 
 class Evidence(Table, Protocol):
@@ -56,7 +56,7 @@ class Evidence(Table, Protocol):
         """The names of the C columns of costs that the terms of this evidence fill."""
         ...
 
-    def begin(self, stage: StageConfig, sight: Sight) -> AnyTerm:
+    def begin(self, stage: StageConfig, prepared: Prepared) -> AnyTerm:
         """The term of a stage, with fixed pixel sets, counts and widths."""
         ...
 
@@ -68,11 +68,11 @@ class _FieldAlone:
         raise AttributeError(f"{kind.__name__} object has no value of this field")
 
 
-class Term(Table, Protocol[WhereT]):
+class Term(Table, Protocol[AnchorT]):
     """A `Term` is one summand of the energy of B cars in a stage. Terms never change.
 
     A term whose rows are equal in all stages is its own `Evidence`. The defaults suit a measurement with one column of
-    costs, whose rows are equal in all stages, can all change, and look nowhere; its class need not override them.
+    costs, whose rows are equal in all stages, can all change, and have no anchor; its class need not override them.
     Fields of a dataclass may replace properties.
     """
 
@@ -123,33 +123,33 @@ class Term(Table, Protocol[WhereT]):
         """Weights (M, R, N) of single residuals; zero in empty places."""
         ...
 
-    def begin(self, stage: StageConfig, sight: Sight) -> AnyTerm:
+    def begin(self, stage: StageConfig, prepared: Prepared) -> AnyTerm:
         """The term of a stage; it is the term itself if the rows are equal in all stages."""
         return self
 
-    def moving(self, sight: Sight, after_wider: bool) -> tuple[Self, WhereT, Tensor]:
-        """Return the rows that can change during the iterations of a stage, where they look, and the cost of the rest.
+    def changing_rows(self, prepared: Prepared, after_wider: bool) -> tuple[Self, AnchorT, Tensor]:
+        """Return the rows that can change during the iterations of a stage, their anchor, and the cost of the rest.
 
         The cost (B, C) of all other rows is in the columns of the term. If `after_wider` is true, an earlier stage had
         a wider contour, so that less motion remains.
         """
         by_car = len(self.blocks.counts), len(self.names)
-        return self, self.where(sight), torch.zeros(by_car, dtype=torch.float64, device=self.blocks.owner.device)
+        return self, self.anchor(prepared), torch.zeros(by_car, dtype=torch.float64, device=self.blocks.owner.device)
 
-    def where(self, sight: Sight) -> WhereT:
-        """Where the rows look at the state of a `Sight`, at which every ray was marched."""
-        return ()  # type: ignore[return-value]  # a term that looks somewhere has its own method
+    def anchor(self, prepared: Prepared) -> AnchorT:
+        """The anchor at a prepared state: constants, such as points on marched rays, near which rows are evaluated."""
+        return ()  # type: ignore[return-value]  # a term with an anchor has its own method
 
-    def linear(self, field: Field, state: State, where: WhereT) -> Linear[WhereT]:
-        """Return residuals with their hand-derived Jacobian; rows look near `where`, which comes from a nearby state.
+    def linear(self, field: Field, state: State, anchor: AnchorT) -> Linear[AnchorT]:
+        """Return residuals with their hand-derived Jacobian; rows are evaluated near `anchor`, of a nearby state.
 
         A user's term may omit this method: `terms.derived` then differentiates its `residual`. With gradients enabled
         the result is differentiable by the state and by all tensors of the term.
         """
         ...
 
-    def residual(self, field: Field, state: State, where: WhereT) -> Tensor:
-        """Differentiable residuals (M, R, N) at a state close to the one whose `linear` gave `where`."""
+    def residual(self, field: Field, state: State, anchor: AnchorT) -> Tensor:
+        """Differentiable residuals (M, R, N) at a state close to the one whose `linear` gave `anchor`."""
         ...
 
     def norm(self, residual: Tensor) -> RobustValue:
@@ -158,26 +158,26 @@ class Term(Table, Protocol[WhereT]):
 
 
 AnyTerm: TypeAlias = Term[Any]
-"""The terms of a sum look at different things."""
+"""The terms of a sum have anchors of different kinds."""
 
 
-class Part(NamedTuple, Generic[WhereT]):
+class Part(NamedTuple, Generic[AnchorT]):
     """A `Part` is what the M blocks of a term add to the sums of their cars, before weighting, float64."""
 
     cost: Tensor  # (M,)
     products: Tensor  # (M, D + 1, D) the Gauss-Newton matrix and, as the last row, the gradient
     information: Tensor  # (M, D, D) the Fisher matrix, or without `fisher` the Gauss-Newton matrix
     residual: Tensor  # (M, R, N)
-    where: WhereT  # the points at which the residuals were taken
+    anchor: AnchorT  # the points at which the residuals were taken
 
 
-def linear_of(term: Term[WhereT], field: Field, state: State, where: WhereT) -> Linear[WhereT]:
+def linear_of(term: Term[AnchorT], field: Field, state: State, anchor: AnchorT) -> Linear[AnchorT]:
     """`term.linear` with a column for each unknown of the state; columns of unseen unknowns are zero."""
-    at = term.linear(field, state, where)
+    at = term.linear(field, state, anchor)
     return at._replace(J_inner_state=state.unknowns.placed(at.J_inner_state, term.sees))
 
 
-def part_of(term: Term[WhereT], at: Linear[WhereT], fisher: bool = True) -> Part[WhereT]:
+def part_of(term: Term[AnchorT], at: Linear[AnchorT], fisher: bool = True) -> Part[AnchorT]:
     """Sum over the rows of each block, from residuals and their Jacobian in factors.
 
     Without `fisher` the information is unused, and the Gauss-Newton matrix takes its place.
@@ -193,15 +193,15 @@ def part_of(term: Term[WhereT], at: Linear[WhereT], fisher: bool = True) -> Part
     if fisher and norm.information_weight is not norm.hessian_weight:
         third = (weight * norm.information_weight * squared).sum(dim=-1)
         information = weighted_products(at.J_inner_state, first, third)[:, :-1]
-    return Part(_block_costs(weight, norm), products, information, at.residual, at.where)
+    return Part(_block_costs(weight, norm), products, information, at.residual, at.anchor)
 
 
-def part_of_rows(term: Term[WhereT], residual: Tensor, J: Tensor, where: WhereT) -> Part[WhereT]:
+def part_of_rows(term: Term[AnchorT], residual: Tensor, J: Tensor, anchor: AnchorT) -> Part[AnchorT]:
     """Sums over the rows of each block, from residuals (M, R, N) and any Jacobian (M, R, N, D) of them."""
     norm, weight = term.norm(residual), term.row_weight
     first, second = (weight * w for w in (norm.gradient_weight, norm.hessian_weight))
     products = weighted_products(J.flatten(1, 2), first.flatten(1, 2), second.flatten(1, 2))
-    return Part(_block_costs(weight, norm), products, products[:, :-1], residual, where)
+    return Part(_block_costs(weight, norm), products, products[:, :-1], residual, anchor)
 
 
 def _block_costs(weight: Tensor, norm: RobustValue) -> Tensor:
@@ -210,10 +210,10 @@ def _block_costs(weight: Tensor, norm: RobustValue) -> Tensor:
 
 @compilable
 def parts_of(
-    terms: tuple[AnyTerm, ...], field: Field, state: State, wheres: tuple[object, ...], fisher: bool = True
+    terms: tuple[AnyTerm, ...], field: Field, state: State, anchors: tuple[object, ...], fisher: bool = True
 ) -> tuple[Part[Any], ...]:
-    """The parts of all terms at a state, with hand-derived Jacobians; rows look near the points `wheres`."""
-    ats = [linear_of(term, field, state, where) for term, where in zip(terms, wheres, strict=True)]
+    """The parts of all terms at a state, with hand-derived Jacobians, near their anchors."""
+    ats = [linear_of(term, field, state, anchor) for term, anchor in zip(terms, anchors, strict=True)]
     return tuple(part_of(term, at, fisher) for term, at in zip(terms, ats, strict=True))
 
 
@@ -231,12 +231,12 @@ def weighted_products(
 
 
 class Evaluation(NamedTuple):
-    """An `Evaluation` is the energy of B cars at one state, float64, and where its rows looked."""
+    """An `Evaluation` is the energy of B cars at one state, float64, with the anchors for the next one."""
 
     cost: Tensor  # (B,)
     gradient: Tensor  # (B, D)
     hessian: Tensor  # (B, D, D) Gauss-Newton matrix
-    wheres: tuple[object, ...]  # points at which each term looked
+    anchors: tuple[object, ...]  # of each term
 
 
 class Figures(NamedTuple):
@@ -258,16 +258,16 @@ def summed(sums: CarSums, weight: Tensor, parts: Sequence[Part[Any]]) -> Evaluat
     """The evaluation that sums the blocks of all terms, with weights (M,) of these blocks."""
     products = sums.sum(torch.cat([part.products for part in parts]), weight)
     cost = sums.sum(torch.cat([part.cost for part in parts]), weight)
-    return Evaluation(cost, products[:, -1], products[:, :-1], tuple(part.where for part in parts))
+    return Evaluation(cost, products[:, -1], products[:, :-1], tuple(part.anchor for part in parts))
 
 
 def by_autograd(
-    terms: Sequence[AnyTerm], prior: ShapePrior, state: State, wheres: Sequence[object]
+    terms: Sequence[AnyTerm], prior: ShapePrior, state: State, anchors: Sequence[object]
 ) -> list[tuple[Tensor, Tensor]]:
     """Return residuals (M, R, N) of every term and their Jacobian (M, R, N, D) by forward-mode differentiation.
 
     Each residual depends on one car only, so one tangent of `retract` moves all cars at once, and D batched tangents
-    share one evaluation of the values. Where the rows look is a constant, as in the hand-derived form.
+    share one evaluation of the values. Anchors are constants, as in the hand-derived form.
     """
 
     unknowns = state.unknowns
@@ -275,7 +275,7 @@ def by_autograd(
     def residuals(delta: Tensor) -> tuple[list[Tensor], list[Tensor]]:
         moved = unknowns.retract(state, delta.expand(len(state.code), unknowns.size))
         field = field_of(prior.bind(moved.code))
-        of_terms = [term.residual(field, moved, where) for term, where in zip(terms, wheres, strict=True)]
+        of_terms = [term.residual(field, moved, anchor) for term, anchor in zip(terms, anchors, strict=True)]
         return of_terms, of_terms
 
     zero = torch.zeros(unknowns.size, dtype=state.code.dtype, device=state.code.device)

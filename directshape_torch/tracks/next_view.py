@@ -37,7 +37,7 @@ from directshape_torch.terms.photometric import (
     near_surface,
 )
 from directshape_torch.terms.photometric_rows import CENTRE, frame_view, is_on_mask
-from directshape_torch.terms.term import Linear, Sight, Term
+from directshape_torch.terms.term import Linear, Prepared, Term
 from directshape_torch.tracks.state import NEXT_POSE, TrackState
 
 NEXT_VIEW_NAME = "next_view"
@@ -98,8 +98,8 @@ class NextViewEvidence(Table):
 
     names = (NEXT_VIEW_NAME,)
 
-    def begin(self, stage: StageConfig, sight: Sight) -> NextView:
-        stereo, left = self.stereo.begin(stage, sight), self.stereo.left
+    def begin(self, stage: StageConfig, prepared: Prepared) -> NextView:
+        stereo, left = self.stereo.begin(stage, prepared), self.stereo.left
         rows, owner = stereo.pixel_set.rows, stereo.blocks.owner
         images = left.pyramid[stage.image_level]
         scale, shift = images.scale, 0.5 * images.scale - 0.5
@@ -110,11 +110,11 @@ class NextViewEvidence(Table):
         grey = rows.intensity_left[CENTRE]
         everywhere = NextImage(images.left.reshape(-1), frame, K, grey, torch.ones_like(grey))
         begun = NextView(self.weight, stereo, self.next_views, everywhere)
-        surface = near_surface(rows.rays, sight.field, sight.state, stereo.where(sight))
+        surface = near_surface(rows.rays, prepared.field, prepared.state, stereo.anchor(prepared))
         points = surface.rays.at(surface.depth)
-        at = begun.looked_up(sight.state, points)
-        assert isinstance(sight.state, TrackState)
-        centre = sight.state.T_obj_next[:, 0, :3, 3][owner].mT[..., None]
+        at = begun.looked_up(prepared.state, points)
+        assert isinstance(prepared.state, TrackState)
+        centre = prepared.state.T_obj_next[:, 0, :3, 3][owner].mT[..., None]
         towards = points - centre
         faces_it = ((surface.normal_obj * towards).sum(0) < 0) & ~is_grazing(surface.normal_obj, towards)
         u, v = ((x.detach() + 0.5) / scale - 0.5 for x in (at.u, at.v))
@@ -172,11 +172,11 @@ class NextView(Term[Surface]):
         J_u, J_v = ((P[n] - w * P[2]) * inverse_z for n, w in ((0, u), (1, v)))
         return LookedUp(u, v, at.value, at.d_u * J_u + at.d_v * J_v, at.inside & in_front)
 
-    def where(self, sight: Sight) -> Surface:
-        return self.stereo.where(sight)
+    def anchor(self, prepared: Prepared) -> Surface:
+        return self.stereo.anchor(prepared)
 
-    def linear(self, field: Field, state: State, where: Surface) -> Linear[Surface]:
-        surface = near_surface(self.stereo.pixel_set.rows.rays, field, state, where)
+    def linear(self, field: Field, state: State, anchor: Surface) -> Linear[Surface]:
+        surface = near_surface(self.stereo.pixel_set.rows.rays, field, state, anchor)
         points = surface.rays.at(surface.depth)
         at = self.looked_up(state, points)
         usable = surface.found & at.inside
@@ -187,26 +187,26 @@ class NextView(Term[Surface]):
         J_pose = torch.cat([J_value_point, cross(points, J_value_point)], dim=-1)
         J = torch.cat([J_depth + torch.nn.functional.pad(J_pose, (0, state.code.shape[1])), -J_pose], dim=-1)
         one = usable[..., None].to(J.dtype)
-        return Linear(residual[..., None], one, J, surface.seen(where, surface.depth, usable))
+        return Linear(residual[..., None], one, J, surface.seen(anchor, surface.depth, usable))
 
-    def residual(self, field: Field, state: State, where: Surface) -> Tensor:
+    def residual(self, field: Field, state: State, anchor: Surface) -> Tensor:
         rays, owner = self.stereo.pixel_set.rows.rays.in_objects(state.T_obj_cam), self.blocks.owner
-        at = self.looked_up(state, rays.at(depth_of(rays, owner, field, where)))
+        at = self.looked_up(state, rays.at(depth_of(rays, owner, field, anchor)))
         lost = self.stereo.config.lost_grey_levels
-        return torch.where(where.usable, at.value - self.image.grey, lost)[..., None]
+        return torch.where(anchor.usable, at.value - self.image.grey, lost)[..., None]
 
     def norm(self, residual: Tensor) -> robust.RobustValue:
         return robust.huber(residual, self.stereo.config.huber_grey_levels)
 
-    def likeness(self, sight: Sight) -> tuple[Tensor, Tensor]:
+    def likeness(self, prepared: Prepared) -> tuple[Tensor, Tensor]:
         """Return how alike (B,) each view and the next are, and how many pixels (B,) are seen in both.
 
         The likeness is the correlation of the grey levels of the pixels seen in both. It is the largest correlation
         over shifts of the next image by up to `_MOST_SHIFT_PX`, because views of one car may be slightly shifted.
         """
-        where, owner, image = self.where(sight), self.blocks.owner, self.image
-        at = self.looked_up(sight.state, where.points_obj)
-        in_both = (where.usable & at.inside & (image.weight > 0)).to(torch.float64)
+        anchor, owner, image = self.anchor(prepared), self.blocks.owner, self.image
+        at = self.looked_up(prepared.state, anchor.points_obj)
+        in_both = (anchor.usable & at.inside & (image.weight > 0)).to(torch.float64)
         sums = CarSums.of(owner, len(self.next_views.exists))
 
         def total(values: Tensor) -> Tensor:

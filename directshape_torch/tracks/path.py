@@ -118,14 +118,14 @@ def with_path(
     place, heading, _, _ = _on_the_ground(cars, state.T_obj_cam)
     assert cars.time_s is not None
     seen = torch.cat([place, _continuous(sharing, cars.time_s, heading)[:, None]], dim=1)
-    everybody, basis = sharing.everybody, _basis(cars).to(torch.float64)
+    everyone, basis = sharing.all_members, _basis(cars).to(torch.float64)
     weight = 1 / deviation_sigma(config, cars.time_s).to(basis).square()
     weight = weight if say is None else weight * say[:, None]
     columns = []
     for column, sigma in enumerate(_of_acceleration(config)):
         weighted = weight[:, column, None] * basis
-        normal = sharing.total(weighted[:, :, None] * basis[:, None], everybody)
-        right = sharing.total(weighted * seen[:, column, None], everybody)
+        normal = sharing.total(weighted[:, :, None] * basis[:, None], everyone)
+        right = sharing.total(weighted * seen[:, column, None], everyone)
         held = torch.diag(normal.new_tensor([0.0, 0.0, 1 / sigma**2]))
         columns.append(torch.linalg.solve(normal + held, right))
     return state._replace(path=torch.cat(columns, dim=1).to(state.code))
@@ -174,8 +174,8 @@ def timed(sharing: Groups, cars: CarBatch) -> CarBatch:
 
 
 def _mean(sharing: Groups, values: Tensor) -> Tensor:
-    everybody = sharing.everybody
-    return sharing.total(values, everybody) / sharing.total(torch.ones_like(values), everybody)
+    everyone = sharing.all_members
+    return sharing.total(values, everyone) / sharing.total(torch.ones_like(values), everyone)
 
 
 def _basis(cars: CarBatch) -> Tensor:

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from directshape_torch.refinement.problem import CarMinimum
 from directshape_torch.solver.damped_solve import damped_step
-from directshape_torch.solver.sharing import said_of_shared
+from directshape_torch.solver.sharing import schur_complement
 from directshape_torch.state.cars import CarBatch, CarState
 from directshape_torch.status import is_refined
 from directshape_torch.terms.photometric import PhotometricEvidence
-from directshape_torch.terms.term import Sight
+from directshape_torch.terms.term import Prepared
 from directshape_torch.tracks.next_view import NextView
 from directshape_torch.tracks.state import own_and_shared
 
@@ -61,7 +61,7 @@ class SaidOfShape:
         nothing = torch.zeros_like(hessian[:, 0])
         _, solvable = damped_step(hessian, nothing, nothing[:, 0])
         # The gradient at a minimum is zero.
-        A, _, has_any = said_of_shared(hessian, nothing, *own_and_shared(minimum.end))
+        A, _, has_any = schur_complement(hessian, nothing, *own_and_shared(minimum.end))
         trusted = torch.where(is_refined(minimum.status)[:, None, None], A, 0.0)
         return cls(trusted, trusted @ minimum.end.code.to(A)[:, :, None], solvable & has_any)
 
@@ -80,13 +80,13 @@ class SaidOfShape:
 
 
 @torch.no_grad()
-def unlikeness(term: NextView, is_cut: Tensor, seen_end: Sight, next_view: Tensor) -> Tensor:
+def unlikeness(term: NextView, is_cut: Tensor, prepared_end: Prepared, next_view: Tensor) -> Tensor:
     """Unlikeness (B,) of each of B views and the next one, beyond what a turning car explains; 0 if it is unknown.
 
     `is_cut` (B,) marks views whose mask is cut off by the border of the image.
     """
-    alike, count = term.likeness(seen_end)
-    towards = torch.nn.functional.normalize(seen_end.state.T_obj_cam[:, :3, 3], dim=1)
+    alike, count = term.likeness(prepared_end)
+    towards = torch.nn.functional.normalize(prepared_end.state.T_obj_cam[:, :3, 3], dim=1)
     turned_deg = (towards * towards[next_view]).sum(dim=1).clamp(-1, 1).arccos().rad2deg()
     explained = (_LESS_LIKE_PER_DEG * turned_deg).clamp_max(_LESS_LIKE_BY_TURNING)
     unlike = torch.where(count >= _FEWEST_PIXELS, (1 - alike - explained).clamp_min(0), 0.0)

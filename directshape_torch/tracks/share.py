@@ -18,7 +18,7 @@ from torch import Tensor
 from directshape_torch.config import StageConfig
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.tables import Chosen, take_rows
-from directshape_torch.refinement.outcome import at_states, going_on, of_views_of_tracks
+from directshape_torch.refinement.make_result import at_states, going_on, of_views_of_tracks
 from directshape_torch.refinement.problem import CarProblem, stage_of
 from directshape_torch.refinement.refined import Refined
 from directshape_torch.refinement.result import RefinementResult
@@ -42,7 +42,7 @@ _IN_COMMON = 0.5
 
 
 def brought_together(
-    problem: CarProblem, cars: CarBatch, initial: CarState, came: RefinementResult
+    problem: CarProblem, cars: CarBatch, initial: CarState, unrefined: RefinementResult
 ) -> RefinementResult:
     """Return the result of B cars, some of which are views of tracks, with the graph of the backward mode.
 
@@ -55,13 +55,13 @@ def brought_together(
     for name in (name for name in (*MOTION_NAMES, NEXT_VIEW_NAME) if name in problem.term_names):
         cure = "give the term another name"
         raise InputError(f"extra term {name!r}: names", "names that no column of a track has", repr(name), cure)
-    alone = Refined.of(problem, cars, initial, initial, came)
+    alone = Refined.of(problem, cars, initial, initial, unrefined)
     says = SaidOfShape.at(alone.minimum)
     doubtful = alone.minimum.status == Status.not_trusted.code
     joins = (is_refined(alone.minimum.status) | doubtful) & says.anything
     parts = parts_by_shape(alone.cars, says, joins)
     while (views := Views.of(alone, parts)) is not None:
-        in_track = views.refined(take_rows(initial, views.chosen.index), came.rows(views.chosen.index))
+        in_track = views.refined(take_rows(initial, views.chosen.index), unrefined.rows(views.chosen.index))
         leaves = views.leaving(in_track, doubtful[views.chosen.index])
         if bool(leaves.any()):
             # The other views start again without the views that leave. This comes before any cut by likeness, because a
@@ -88,8 +88,8 @@ def _joined(
         ends = ends | views.chosen.keep
     states = alone.states(initial, ends)
     # The steps of a track depend on all of its views, trusted or not.
-    everybody = torch.ones_like(rows, dtype=torch.bool)
-    of_views = in_track.states(views.agreed(take_rows(states, rows)), everybody)
+    everyone = torch.ones_like(rows, dtype=torch.bool)
+    of_views = in_track.states(views.agreed(take_rows(states, rows)), everyone)
     in_common = torch.lerp(in_track.found.covariance, alone.found.covariance[rows], _IN_COMMON)
     of_track = replace(in_track.found, track_part=views.part_of(status), covariance=in_common)
     of_track = of_views_of_tracks(of_track, in_track.minimum.end, in_track.cars)
@@ -138,10 +138,10 @@ class Views:
         hessian = minimum.after.hessian.sum(dim=1)[rows]
         return cls(chosen, problem, sharing, alone.cars, views, ends, hessian, part_number, next_view)
 
-    def refined(self, initial: CarState, came: RefinementResult) -> Refined[TrackState]:
+    def refined(self, initial: CarState, unrefined: RefinementResult) -> Refined[TrackState]:
         """The views refined together, starting from the shape on which they agree."""
         cars = self.cars.of(self.chosen)
-        return Refined.of(self.problem, cars, self.linked(initial), self.agreed(self.alone), came)
+        return Refined.of(self.problem, cars, self.linked(initial), self.agreed(self.alone), unrefined)
 
     def agreed(self, alone: CarState) -> TrackState:
         """Return states (R) with the one shape on which the views agree best, and with the poses that belong to it.
@@ -153,8 +153,8 @@ class Views:
         of_code, max_code = unknowns.span(CODE), self.problem.config.solver.max_code
         step = unknowns.placed(alone.code.to(self.hessian.dtype), (CODE,))
         slope = -(self.hessian @ step[:, :, None])[:, :, 0]
-        undamped, everybody = torch.zeros_like(slope[:, 0]), torch.ones_like(slope[:, 0], dtype=torch.bool)
-        to_agreement, _ = self.agreement.damped_step(self.hessian, slope, undamped, everybody)
+        undamped, everyone = torch.zeros_like(slope[:, 0]), torch.ones_like(slope[:, 0], dtype=torch.bool)
+        to_agreement, _ = self.agreement.damped_step(self.hessian, slope, undamped, everyone)
         code = to_agreement[:, of_code].to(alone.code).clamp(-max_code, max_code)
         return self.linked(unknowns.retract(alone, to_agreement - step)._replace(code=code))
 
@@ -179,7 +179,7 @@ class Views:
         stereo = _photometric(self.problem)
         if term is None or stereo is None:
             return nothing
-        unlike = unlikeness(term, is_cut_off(stereo), minimum.seen_end, self.next_view)
+        unlike = unlikeness(term, is_cut_off(stereo), minimum.prepared_end, self.next_view)
         return nothing.index_copy(0, self.chosen.index, unlike)
 
     def part_of(self, status: Tensor) -> Tensor:
@@ -226,7 +226,7 @@ def in_tracks(
     if added:
         # A track has one acceleration, so its prior is divided among all views.
         hold = hold_of_path(config.tracks, sharing, views, alone, trusted)
-        columns = [hold, 1 / sharing.total(one, sharing.everybody)]
+        columns = [hold, 1 / sharing.total(one, sharing.all_members)]
     stereo = _photometric(problem)
     if stereo is not None and _looks_at_next(problem):
         added.append(NextViewEvidence(config.tracks.next_view_weight, stereo, NextViews.of(views, next_view)))

@@ -26,7 +26,7 @@ class TrackState(NamedTuple):
 
     @classmethod
     def of(cls, state: State) -> TrackState:
-        """State of views that follow no path and look at no other view."""
+        """State of views that follow no path and have no next view."""
         code = state.code
         return cls(
             state.T_obj_cam, code, state.offset_px, code.new_zeros(len(code), 0), code.new_zeros(len(code), 0, 4, 4)

@@ -70,8 +70,8 @@ class RefinementTrace:
     @torch.no_grad()
     def residuals(self, number: int) -> dict[int, CarResiduals]:
         """Residuals of state `number` of each car that took part, by its row among the detections."""
-        sight = self.last_stage.problem.look(take_rows(self.states[number], self.rows))
-        return dict(zip(self.rows.tolist(), car_residuals(self.last_stage, self.pixels, sight), strict=True))
+        prepared = self.last_stage.problem.prepare(take_rows(self.states[number], self.rows))
+        return dict(zip(self.rows.tolist(), car_residuals(self.last_stage, self.pixels, prepared), strict=True))
 
     def place_of(self, car: int) -> int:
         """Number of a car among the cars that took part; -1 if it did not."""
@@ -101,7 +101,7 @@ def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections
     with full_precision(), compiling(refiner.config.compile):
         minimum: CarMinimum[CarState] = minimise(problem, initial, refiner.config.solver, record=True)
         states = [initial, *_ends(minimum)]
-        costs = torch.stack([minimum.stage.figures(problem.look(state)).term_costs for state in states])
+        costs = torch.stack([minimum.stage.figures(problem.prepare(state)).term_costs for state in states])
     none = torch.zeros_like(took_part.keep)
     accepted = [none.index_copy(0, rows, iteration.accepted) for iteration in minimum.trajectory]
     return RefinementTrace(

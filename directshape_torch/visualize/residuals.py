@@ -23,7 +23,7 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rows import PixelSamples, Rows
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.photometric import Photometric, Surface
-from directshape_torch.terms.term import Part, Sight
+from directshape_torch.terms.term import Part, Prepared
 from directshape_torch.visualize.drawing import Array, View, blue_white_red
 
 WORST_SILHOUETTE = 4.6
@@ -66,9 +66,9 @@ _Pixels = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 @torch.no_grad()
-def car_residuals(stage: CarStage, pixels: Observation, sight: Sight) -> list[CarResiduals]:
+def car_residuals(stage: CarStage, pixels: Observation, prepared: Prepared) -> list[CarResiduals]:
     """Residuals of R cars at an observed state, in a stage that has begun with these pixels."""
-    figures, masks = stage.figures(sight), stage.problem.masks
+    figures, masks = stage.figures(prepared), stage.problem.masks
     nothing = torch.zeros(0)
     parts: dict[str, _Pixels] = dict.fromkeys(
         CarResiduals._fields, (nothing, nothing.view(0, 2), nothing, nothing.bool())
@@ -84,7 +84,7 @@ def car_residuals(stage: CarStage, pixels: Observation, sight: Sight) -> list[Ca
         parts["photometric"] = _of_photometry(photometric, at_photometric, pixels.left)
     return [
         CarResiduals(*(_of_car(parts[name], car) for name in CarResiduals._fields))
-        for car in range(len(sight.state.code))
+        for car in range(len(prepared.state.code))
     ]
 
 
@@ -98,10 +98,10 @@ def _of_photometry(term: Photometric, at: Part[Surface], left: PixelSamples) -> 
     counted = fixed.rows.pixel_weight > 0
     weight = fixed.rows.neighbour_weight.movedim(0, -1)
     mean = (at.residual * weight).sum(dim=-1) / weight.sum(dim=-1).clamp_min(1)
-    # A `Sight` has the left pixels in their packed blocks.
-    pixel = Rows.of_sorted(left.object_index, len(term.cars)).row.flatten()[fixed.sight_place]
+    # A `Prepared` has the left pixels in their packed blocks.
+    pixel = Rows.of_sorted(left.object_index, len(term.cars)).row.flatten()[fixed.prepared_place]
     car = fixed.blocks.owner[:, None].expand_as(counted)
-    return car[counted], left.uv[pixel[counted]], mean[counted], ~at.where.usable[counted]
+    return car[counted], left.uv[pixel[counted]], mean[counted], ~at.anchor.usable[counted]
 
 
 @torch.no_grad()
@@ -135,8 +135,8 @@ def residual_maps(
         pixels = pack_pixels(frame, detections, sampling).of(chosen)
         for state in states:
             T_cam_obj, code = (torch.from_numpy(np.asarray(x)).to(start.code) for x in state)
-            sight = problem.look(start._replace(T_obj_cam=se3.inverse(T_cam_obj), code=code))
-            found.append(car_residuals(problem.begin(-1, sight), pixels, sight))
+            prepared = problem.prepare(start._replace(T_obj_cam=se3.inverse(T_cam_obj), code=code))
+            found.append(car_residuals(problem.begin(-1, prepared), pixels, prepared))
     return found
 
 

@@ -21,7 +21,7 @@ from benchmark_suites.times import make_refiner
 from benchmark_suites.timing import Row, Spread
 from benchmark_suites.workloads import demo_scene
 from directshape_torch.io.frame_collation import collate
-from directshape_torch.refinement.outcome import outcome_of
+from directshape_torch.refinement.make_result import result_of
 from directshape_torch.refinement.problem import CarIterations, CarProblem, CarStage
 from directshape_torch.refinement.scene_problem import problem_of_scene
 from directshape_torch.refiner import DirectShapeRefiner
@@ -39,7 +39,7 @@ _OUTCOME = "outcome: covariance, quality, profile, trust"
 # The functions themselves are listed, so that removing one makes its line fail.
 PARTS: dict[str, tuple[Any, ...]] = {
     "observation: regions, occlusion, pixels": (DirectShapeRefiner._observe, problem_of_scene),
-    "marched rays and first hits": (CarProblem.look,),
+    "marched rays and first hits": (CarProblem.prepare,),
     "tracked rays": (depth.tracked_closest, depth.tracked_depth),
     "beginning of stages": (CarProblem.begin, CarStage.start),
     "grids of the cars": (PCAShapePrior.bind,),
@@ -50,7 +50,7 @@ PARTS: dict[str, tuple[Any, ...]] = {
     "solve and step": (damped_step, Unknowns.retract),
     "iterations, the rest": (iterate, CarIterations.choose, CarIterations.of, CarIterations.evaluation_of),
     "figures at the end": (CarStage.figures,),
-    _OUTCOME: (outcome_of,),
+    _OUTCOME: (result_of,),
 }
 
 

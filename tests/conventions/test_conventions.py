@@ -333,15 +333,15 @@ def test_25_letters() -> None:
     stage, state = begun_stage(prior, scene.frames, scene.detections)
     B, K_, F = len(scene.detections), prior.num_codes, len(scene.frames)
     D, S, N = 6 + K_, DEFAULT.silhouette.samples_per_ray, len(DSO_PATTERN)
-    term, sight = photometric_of(stage), stage.problem.look(state)
+    term, prepared = photometric_of(stage), stage.problem.prepare(state)
     P = len(left_of(stage).pixels)
     H, W = scene.frames.images_left.shape[2:]
     assert left_of(stage).pixels.uv.shape == (P, 2)
     left, _ = stage.problem.masks.of_sides
     owner, rays = left.owner, left.in_objects(state.T_obj_cam)
-    assert march(sight.field, owner, rays, prior.bounds_obj, S).sdf.shape == (S, len(owner), 64)
+    assert march(prepared.field, owner, rays, prior.bounds_obj, S).sdf.shape == (S, len(owner), 64)
     assert len(term.pixel_set.rows.intensity_left) == N == 8
-    _, at = stage.start(sight)
+    _, at = stage.start(prepared)
     assert (at.cost.shape, at.gradient.shape, at.hessian.shape) == ((B,), (B, D), (B, D, D))
     assert scene.frames.images_left.shape == (F, 3, H, W)
     assert scene.detections.mask_left.dense().shape == (B, H, W)
@@ -352,7 +352,7 @@ def test_26_systems_are_float64() -> None:
     stage, state = begun_stage(
         ellipsoid_prior(torch.float32), scene.frames.to(dtype=torch.float32), scene.detections.to(dtype=torch.float32)
     )
-    _, at = stage.start(stage.problem.look(state))
+    _, at = stage.start(stage.problem.prepare(state))
     assert at.cost.dtype == at.gradient.dtype == at.hessian.dtype == torch.float64
     assert left_of(stage).pixels.uv.dtype == state.code.dtype == torch.float32
 

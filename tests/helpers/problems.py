@@ -63,12 +63,12 @@ def begun_stage(
 ) -> tuple[CarStage, CarState]:
     """A stage of the problem of these cars that has begun at the input state, and that state."""
     problem, state = DirectShapeRefiner(prior, config).problem(frames, detections)
-    return problem.begin(stage, problem.look(state)), state
+    return problem.begin(stage, problem.prepare(state)), state
 
 
 def figures_at(stage: CarStage, state: CarState) -> Figures:
     """The energy at a state, with all rays marched."""
-    return stage.figures(stage.problem.look(state))
+    return stage.figures(stage.problem.prepare(state))
 
 
 def photometric_of(stage: CarStage) -> Photometric:

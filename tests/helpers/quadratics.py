@@ -52,7 +52,7 @@ class VectorProblem:
     def stages(self) -> list[StageConfig]:
         return self.stage_configs
 
-    def look(self, state: Vector) -> Vector:
+    def prepare(self, state: Vector) -> Vector:
         return state
 
     def begin(self, stage: int, seen: Vector) -> Self:

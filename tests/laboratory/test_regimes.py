@@ -43,7 +43,7 @@ def test_views_of_a_track_are_seen_in_the_next(bench_of: BenchOf) -> None:
 def test_pixels_of_a_regime(bench_of: BenchOf, prior: PCAShapePrior) -> None:
     at = bench_of("contour")
     filled = at.problem.masks.filled > 0
-    sdf = at.sight.field.sdf(at.sight.closest.points_obj, at.problem.masks.rays.owner)
+    sdf = at.prepared.field.sdf(at.prepared.closest.points_obj, at.problem.masks.rays.owner)
     exponent = (at.terms["silhouettes"].zeta * sdf).abs()[filled]  # type: ignore[attr-defined]
     assert len(exponent) > 5
     assert (exponent < 3).all()
@@ -52,12 +52,12 @@ def test_pixels_of_a_regime(bench_of: BenchOf, prior: PCAShapePrior) -> None:
     num_left = len(at.problem.masks.of_sides[0].owner)
     left = at.problem.masks.filled[:num_left] > 0
     direction = at.problem.masks.rays.in_objects(at.state.T_obj_cam).direction_obj[:, :num_left]
-    cosine = torch.cosine_similarity(at.sight.hits.normal_obj, direction, dim=0)[left]
+    cosine = torch.cosine_similarity(at.prepared.hits.normal_obj, direction, dim=0)[left]
     assert len(cosine) > 5
     assert (cosine.abs() < 0.31).all()
 
     at = bench_of("grid_border")
-    near = near_border(prior, at.sight.closest.points_obj)[at.problem.masks.filled > 0]
+    near = near_border(prior, at.prepared.closest.points_obj)[at.problem.masks.filled > 0]
     assert len(near) > 5
     assert near.float().mean() > 0.9
 

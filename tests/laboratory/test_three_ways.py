@@ -54,7 +54,7 @@ def test_terms_against_differences(bench_of: BenchOf, regime: str) -> None:
 def test_a_bench_finds_minima_inside_cells_and_on_their_faces_and_borders(bench_of: BenchOf) -> None:
     """All kinds of closest points are among those that are differenced above."""
     bench = bench_of("grid_border")
-    face = bench.rows["silhouettes"].where.face_obj.abs().sum(0)  # type: ignore[attr-defined]
+    face = bench.rows["silhouettes"].anchor.face_obj.abs().sum(0)  # type: ignore[attr-defined]
     assert bool((face == 0).any())
     assert bool((face == 1).any())
 
@@ -66,12 +66,12 @@ def test_rays_are_closest_where_they_are_said_to_be(bench_of: BenchOf, regime: s
     masks, term = bench.problem.masks, bench.terms["silhouettes"]
     moved = bench.moved(torch.full((bench.num_unknowns,), 1e-3, dtype=torch.float64))
     field = field_of(bench.problem.prior.bind(moved.code))
-    tracked = term.linear(field, moved, bench.sight.closest).where
+    tracked = term.linear(field, moved, bench.prepared.closest).anchor
     assert isinstance(tracked, Closest)
     offset = torch.linspace(-0.004, 0.004, 161, dtype=torch.float64)[:, None, None]
     # The border is left out, by a tenth of a millimetre.
     lower, upper = (x.view(3, 1, 1, 1) for x in bench.problem.prior.bounds_obj)
-    for at, state, closest in ((bench.sight.field, bench.state, bench.sight.closest), (field, moved, tracked)):
+    for at, state, closest in ((bench.prepared.field, bench.state, bench.prepared.closest), (field, moved, tracked)):
         points = masks.rays.in_objects(state.T_obj_cam).at(closest.depth + offset)
         inside = ((points >= lower + 1e-4) & (points <= upper - 1e-4)).all(0)
         sdf = at.sdf(points, masks.rays.owner)
@@ -95,10 +95,10 @@ def test_sums_are_those_of_single_residuals(bench_of: BenchOf, regime: str) -> N
     factors = torch.linspace(0.5, 2.0, num_cars * len(bench.problem.term_names)).double().view(num_cars, -1)
     problem = replace(bench.problem, factors=factors)
     stage = replace(bench.stage, problem=problem)
-    figures = stage.figures(bench.sight)
+    figures = stage.figures(bench.prepared)
     column = 0
     for number_of_term, term in enumerate(stage.terms):
-        at = linear_of(term, bench.sight.field, bench.state, term.where(bench.sight))
+        at = linear_of(term, bench.prepared.field, bench.state, term.anchor(bench.prepared))
         norm, J = term.norm(at.residual), jacobian(at)
         assert torch.equal(figures.parts[number_of_term].residual, at.residual)
         for number in range(len(term.names)):
@@ -117,11 +117,11 @@ def test_sums_are_those_of_single_residuals(bench_of: BenchOf, regime: str) -> N
                 for found, by_hand in zip(figures[:4], expected, strict=True):
                     torch.testing.assert_close(found[car, column], by_hand, rtol=1e-11, atol=1e-12)
             column += 1
-    iterations, start = stage.start(bench.sight)
-    again = iterations.evaluated(bench.sight.field, bench.state, start.wheres)
+    iterations, start = stage.start(bench.prepared)
+    again = iterations.evaluated(bench.prepared.field, bench.state, start.anchors)
     solver = replace(problem.config.solver, jacobian="autograd")
     witness = replace(stage, problem=replace(problem, config=replace(problem.config, solver=solver)))
-    by_autograd = witness.start(bench.sight)[1]
+    by_autograd = witness.start(bench.prepared)[1]
     for seen_by_solver in (start, again, by_autograd):
         torch.testing.assert_close(seen_by_solver.cost, figures.cost, rtol=1e-6, atol=0)
         # Rays that rest are left out of gradient and matrix: they are certain.
@@ -135,12 +135,12 @@ def test_sums_are_those_of_single_residuals(bench_of: BenchOf, regime: str) -> N
 def test_a_tracked_pixel_ends_on_the_surface(bench_of: BenchOf) -> None:
     """After a step of the car the depth is a Newton step nearer to the surface than the point it is taken from."""
     bench = bench_of("typical", pixels=40)
-    term, field = bench.stage.photometric, bench.sight.field
+    term, field = bench.stage.photometric, bench.prepared.field
     assert term is not None
     step = torch.full((len(bench.state.code), bench.num_unknowns), 0.03, dtype=torch.float64)
     moved = bench.state.unknowns.retract(bench.state, step, max_code=3.0)._replace(code=bench.state.code)
     rays = term.pixel_set.rows.rays
-    found = photometric.near_surface(rays, field, moved, term.where(bench.sight))
+    found = photometric.near_surface(rays, field, moved, term.anchor(bench.prepared))
     here, end = (
         field.sdf(points, rays.owner)[found.found].abs() for points in (found.points_obj, found.rays.at(found.depth))
     )

@@ -44,7 +44,7 @@ def photometric(term: Photometric, pixels: LeftPixels, level: int, depth: Tensor
     residual = torch.zeros(*depth.shape, 8, dtype=depth.dtype)
     landed = torch.zeros(*depth.shape, 8, 2, dtype=depth.dtype)
     in_front = torch.zeros(*depth.shape, 8, dtype=depth.dtype)
-    row = pixels.packed.row.flatten()[fixed.sight_place]
+    row = pixels.packed.row.flatten()[fixed.prepared_place]
     for block, car in enumerate(fixed.blocks.owner.tolist()):
         frame, own = term.cars.frame_index[car], row[block]
         height, width = images.sizes[frame].tolist()

@@ -45,7 +45,7 @@ def begun(frames: FrameBatch, scene: Street, config: RefinerConfig = DEFAULT) ->
 
 def surface_at(stage: CarStage, state: CarState) -> Surface | None:
     rows = stage.photometric_part(figures_at(stage, state))
-    return None if rows is None else rows.where  # type: ignore[return-value]
+    return None if rows is None else rows.anchor  # type: ignore[return-value]
 
 
 def profile_at(stage: CarStage, before: CarState, after: CarState, **settings: Any) -> DisparityProfile:

@@ -18,9 +18,9 @@ from directshape_torch.scene import FrameBatch
 def halves_apart(frames: FrameBatch) -> Tensor:
     prior, scene = cached_street()
     stage, state = begun_stage(prior, frames, scene.detections)
-    at = stage.photometric_part(stage.figures(stage.problem.look(state)))
+    at = stage.photometric_part(stage.figures(stage.problem.prepare(state)))
     assert at is not None
-    return disparity_profile(stage.photometric, at.where, at.where, len(state.code), state.code).halves_apart
+    return disparity_profile(stage.photometric, at.anchor, at.anchor, len(state.code), state.code).halves_apart
 
 
 def test_halves_of_one_car_agree_and_those_of_two_places_do_not() -> None:
@@ -38,7 +38,7 @@ def test_halves_of_one_car_agree_and_those_of_two_places_do_not() -> None:
 def quality(distance: Tensor, chances: tuple[Tensor, Tensor]) -> FitQuality:
     prior, scene = cached_street()
     stage, state = begun_stage(prior, scene.frames, scene.detections)
-    seen = stage.problem.look(state)
+    seen = stage.problem.prepare(state)
     return fit_quality(stage, stage.figures(seen), seen, torch.tensor([0.02, 0.48]).double(), distance, chances)
 
 
@@ -57,11 +57,11 @@ def test_columns_by_hand_and_a_car_that_is_not_there_is_not_better() -> None:
 def test_the_contrast_is_the_deviation_within_neighbourhoods() -> None:
     prior, scene = cached_street()
     stage, state = begun_stage(prior, scene.frames, scene.detections)
-    term, at = photometric_of(stage), stage.photometric_part(stage.figures(stage.problem.look(state)))
+    term, at = photometric_of(stage), stage.photometric_part(stage.figures(stage.problem.prepare(state)))
     assert at is not None
     error, _, contrast = photometric_agreement(term, at)
     rows = term.pixel_set.rows
-    usable = at.where.usable & (rows.pixel_weight > 0)
+    usable = at.anchor.usable & (rows.pixel_weight > 0)
     for car in range(2):
         mine = usable & (term.pixel_set.blocks.owner == car)[:, None]
         weight, grey = rows.neighbour_weight.movedim(0, -1)[mine], rows.intensity_left.movedim(0, -1)[mine]

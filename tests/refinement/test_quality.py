@@ -10,7 +10,7 @@ from helpers.problems import DEFAULT, begun_stage, figures_at, photometric_of
 from helpers.synthetic_scene import cached_street, disturbed
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.refinement.outcome import as_they_came, outcome_of
+from directshape_torch.refinement.make_result import result_of, unrefined_result
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refinement.quality import mask_ious, photometric_agreement
 from directshape_torch.solver.gauss_newton import Minimum
@@ -27,7 +27,7 @@ def test_mask_overlap_is_that_of_rays_through_the_shape() -> None:
     """Covered: some of 400 points on the ray is inside; counted car by car in a loop."""
     stage, state = begun()
     problem = stage.problem
-    masks, seen = problem.masks, problem.look(state)
+    masks, seen = problem.masks, problem.prepare(state)
     found = mask_ious(masks, seen)
     assert found.shape == (2, 2)
     rays = masks.rays.in_objects(state.T_obj_cam)
@@ -52,7 +52,7 @@ def test_a_mask_of_nothing_on_a_shape_beside_all_pixels_has_no_overlap() -> None
     masks = stage.problem.masks
     empty = ((masks.rays.owner == 0) & (masks.side == 0))[:, None]
     masks = replace(masks, foreground=torch.where(empty, 0.0, masks.foreground))
-    found = mask_ious(masks, stage.problem.look(CarState.of(T, state.code)))
+    found = mask_ious(masks, stage.problem.prepare(CarState.of(T, state.code)))
     assert found[0, 0].isnan()
     assert found[1, 0] == 0
     assert (found[:, 1] > 0.8).all()
@@ -70,7 +70,7 @@ def test_photometric_agreement_is_the_mean_over_the_usable_pixels_car_by_car() -
         error, share, _ = photometric_agreement(term, rows)
         for car in range(2):
             in_set = (fixed.rows.pixel_weight > 0) & (fixed.blocks.owner == car)[:, None]
-            usable = in_set & rows.where.usable
+            usable = in_set & rows.anchor.usable
             weight = fixed.rows.neighbour_weight.movedim(0, -1)[usable]
             expected = (weight * rows.residual[usable].abs()).sum() / weight.sum()
             torch.testing.assert_close(error[car], expected, rtol=1e-9, atol=0)
@@ -81,7 +81,7 @@ def test_a_car_with_its_input_back_costs_after_what_it_cost_before() -> None:
     stage, initial = begun()
     problem = stage.problem
     end = CarState.of(initial.T_obj_cam.clone(), initial.code + 0.5)
-    seen_initial, seen_end = problem.look(initial), problem.look(end)
+    prepared_initial, prepared_end = problem.prepare(initial), problem.prepare(end)
     minimum = Minimum(
         state=CarState(*(torch.stack([a[0], b[1]]) for a, b in zip(initial, end, strict=True))),
         end=end,
@@ -90,14 +90,14 @@ def test_a_car_with_its_input_back_costs_after_what_it_cost_before() -> None:
         cost_history=torch.zeros(2, 0).double(),
         stage_starts=(initial,),
         stage=stage,
-        seen_end=seen_end,
-        before=stage.figures(seen_initial),
-        after=stage.figures(seen_end),
+        prepared_end=prepared_end,
+        before=stage.figures(prepared_initial),
+        after=stage.figures(prepared_end),
     )
     scene = cached_street()[1]
     frames, detections = scene.frames, disturbed(scene.detections)
-    came = as_they_came(problem.prior, frames, detections, minimum.status, problem.term_names)
-    found = outcome_of(problem, minimum, CarBatch.from_scene(frames, detections), came)
+    unrefined = unrefined_result(problem.prior, frames, detections, minimum.status, problem.term_names)
+    found = result_of(problem, minimum, CarBatch.from_scene(frames, detections), unrefined)
     at_end, at_input = (figures_at(stage, state).term_costs for state in (end, initial))
     assert torch.equal(found.cost_before, at_input)
     assert torch.equal(found.cost_after, torch.stack([at_input[0], at_end[1]]))

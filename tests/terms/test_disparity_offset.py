@@ -58,13 +58,13 @@ def test_an_offset_does_what_a_constant_field_does(level: int) -> None:
             ellipsoid_prior(), frames, _unsure(disturbed(scene.detections, 0.05, 0.02)), DEFAULT, 1 - level
         )
         state = state._replace(offset_px=torch.full_like(state.offset_px, offset_px))
-        stage = stage.problem.begin(1 - level, stage.problem.look(state))
-        term, sight = photometric_of(stage), stage.problem.look(state)
-        at = term.linear(sight.field, state, term.where(sight))
-        again = term.residual(sight.field, state, at.where)
-        found.append((at.residual, again, at.where.usable, term.pixel_set.support))
-        depth, surface = at.where.depth, term.where(sight).depth
-        torch.testing.assert_close(depth[at.where.usable], surface[at.where.usable], rtol=1e-6, atol=0)
+        stage = stage.problem.begin(1 - level, stage.problem.prepare(state))
+        term, prepared = photometric_of(stage), stage.problem.prepare(state)
+        at = term.linear(prepared.field, state, term.anchor(prepared))
+        again = term.residual(prepared.field, state, at.anchor)
+        found.append((at.residual, again, at.anchor.usable, term.pixel_set.support))
+        depth, surface = at.anchor.depth, term.anchor(prepared).depth
+        torch.testing.assert_close(depth[at.anchor.usable], surface[at.anchor.usable], rtol=1e-6, atol=0)
     for one, other in zip(*found, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
     assert found[0][3].min() > 50

@@ -72,8 +72,8 @@ def test_cost_is_the_mean_norm_of_the_distances() -> None:
     problem, state = DirectShapeRefiner(PRIOR, extra_terms=[LidarPoints(weight=7.0, huber_m=0.2)]).problem(
         frames, SCENE.detections
     )
-    sight = problem.look(state)
-    cost = problem.begin(0, sight).figures(sight).term_costs[0, -1]
+    prepared = problem.prepare(state)
+    cost = problem.begin(0, prepared).figures(prepared).term_costs[0, -1]
     points = seen(0) @ state.T_obj_cam[0, :3, :3].T + state.T_obj_cam[0, :3, 3]
     sdf = PRIOR.bind(state.code).value(points, torch.zeros(len(points), dtype=torch.long)).abs()
     norm = torch.where(sdf < 0.2, sdf**2 / 2, 0.2 * (sdf - 0.1))

@@ -89,8 +89,8 @@ def test_a_pixel_that_leaves_the_right_image_pays_the_constant() -> None:
     term = photometric_of(stage)
     # Along its viewing ray, so that the pixels still hit it.
     nearer = _translated(state, (-0.5 * torch.linalg.inv(state.T_obj_cam[0])[:3, 3]).tolist())
-    sight = stage.problem.look(nearer)
-    at = term.linear(sight.field, nearer, term.where(sight))
+    prepared = stage.problem.prepare(nearer)
+    at = term.linear(prepared.field, nearer, term.anchor(prepared))
     depth, found = reference.surface_depth(stage.problem.prior, term, nearer)
     _, landed, _ = reference.photometric(term, left_of(stage), 0, torch.where(found, depth, 1.0))
     left_image = found & (landed[..., 0] < -0.5).any(-1) & (term.pixel_set.rows.pixel_weight > 0)
@@ -132,7 +132,7 @@ def test_pixel_sets_and_their_weights() -> None:
         stage, _ = _stage(config)
         term = photometric_of(stage)
         counted = term.pixel_set.rows.pixel_weight > 0
-        own = left_of(stage).packed.row.flatten()[term.pixel_set.sight_place][counted]
+        own = left_of(stage).packed.row.flatten()[term.pixel_set.prepared_place][counted]
         assert bool((left_of(stage).pixels.foreground[own] > 0.5).all()) is needs_mask
         assert int(counted.sum()) == int(term.pixel_set.support.sum())
         c2 = GRADIENT_CONSTANT**2

@@ -120,7 +120,7 @@ def test_zeta_comes_from_the_input_depth_and_not_from_the_state() -> None:
     torch.testing.assert_close(term.zeta[:, 0], expected[term.blocks.owner])
     nearer = CarState.of(se3.exp(vector(0, 0, 2.0, 0, 0, 0)) @ state.T_obj_cam, state.code)
     problem = stage.problem
-    again, softer = (problem.begin(x, problem.look(nearer)).terms[0] for x in (1, 0))
+    again, softer = (problem.begin(x, problem.prepare(nearer)).terms[0] for x in (1, 0))
     assert isinstance(again, Silhouettes)
     assert isinstance(softer, Silhouettes)
     assert torch.equal(again.zeta, term.zeta)

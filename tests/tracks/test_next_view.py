@@ -20,7 +20,7 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.field import field_of
 from directshape_torch.terms.photometric import Brightness, PhotometricEvidence
-from directshape_torch.terms.term import Sight
+from directshape_torch.terms.term import Prepared
 from directshape_torch.tracks.next_view import NextView, NextViewEvidence, NextViews
 from directshape_torch.tracks.state import TrackState
 
@@ -61,11 +61,11 @@ def at_truth(
     return replace(problem, evidence=(evidence,)), views
 
 
-def begun(problem: CarProblem, state: TrackState, stage: int = 1) -> tuple[NextView, Sight]:
-    sight = problem.look(state)
-    (term,) = problem.begin(stage, sight).terms
+def begun(problem: CarProblem, state: TrackState, stage: int = 1) -> tuple[NextView, Prepared]:
+    prepared = problem.prepare(state)
+    (term,) = problem.begin(stage, prepared).terms
     assert isinstance(term, NextView)
-    return term, sight
+    return term, prepared
 
 
 def disturbed(state: TrackState) -> TrackState:
@@ -77,11 +77,11 @@ def disturbed(state: TrackState) -> TrackState:
 
 def test_true_poses_and_shapes_explain_the_next_view() -> None:
     problem, state = at_truth(*drive())
-    term, sight = begun(problem, state)
+    term, prepared = begun(problem, state)
     counts = term.row_weight > 0
 
     def mean_residual(at: TrackState) -> float:
-        residual = term.linear(field_of(problem.prior.bind(at.code)), at, term.where(sight)).residual
+        residual = term.linear(field_of(problem.prior.bind(at.code)), at, term.anchor(prepared)).residual
         return float(residual[counts].abs().mean())
 
     step = torch.zeros(6, state.unknowns.size, dtype=torch.float64)
@@ -116,8 +116,8 @@ def test_pixels_count_that_the_next_view_shows() -> None:
 
 def test_one_car_looks_alike_in_the_next_view_a_little_beside_itself_too() -> None:
     problem, state = at_truth(*drive())
-    term, sight = begun(problem, state)
-    alike, count = term.likeness(sight)
+    term, prepared = begun(problem, state)
+    alike, count = term.likeness(prepared)
     assert (alike[:4] > 0.97).all()
     assert (alike[4:] == -1).all()
     assert count.tolist() == [float((term.row_weight[term.blocks.owner == car] > 0).sum()) for car in range(6)]
@@ -125,7 +125,9 @@ def test_one_car_looks_alike_in_the_next_view_a_little_beside_itself_too() -> No
     for shift_px, least, most in ((2.5, 0.9, 1.0), (9.0, -1.0, 0.8)):
         aside = torch.zeros(6, 6, dtype=torch.float64)
         aside[:, 0] = shift_px * depth / FOCAL_PX
-        beside, _ = term.likeness(problem.look(state._replace(T_obj_next=state.T_obj_next @ se3.exp(aside)[:, None])))
+        beside, _ = term.likeness(
+            problem.prepare(state._replace(T_obj_next=state.T_obj_next @ se3.exp(aside)[:, None]))
+        )
         assert (beside[:4] > least).all()
         assert (beside[:4] < most).all()
 
@@ -139,8 +141,8 @@ def test_another_car_does_not_look_alike() -> None:
     even = torch.where(detections.mask_left.dense().view(3, 2, 1, 120, 160).amax(dim=1) > 0, 0.3, frames.images_left)
     for images, least, most in ((frames.images_left, 0.97, 1.0), (grey, -1.0, 0.5), (even, 0.8, 1.0)):
         problem, state = at_truth(replace(frames, images_left=images), detections)
-        term, sight = begun(problem, state)
-        alike, _ = term.likeness(sight)
+        term, prepared = begun(problem, state)
+        alike, _ = term.likeness(prepared)
         assert least < alike[0] < most
 
 
@@ -175,7 +177,7 @@ def shifted(values: Tensor, row: int, by: int) -> Tensor:
 @pytest.mark.parametrize("stage", [0, 1])
 def test_the_next_frame_may_have_another_camera_and_size(stage: int) -> None:
     frames, detections = drive()
-    whole, sight = begun(*at_truth(frames, detections), stage)
+    whole, prepared = begun(*at_truth(frames, detections), stage)
     K_left, K_right = frames.camera.K_left.clone(), frames.camera.K_right.clone()
     K_left[1, 0, 2] -= 8
     K_right[1, 0, 2] -= 8
@@ -187,8 +189,8 @@ def test_the_next_frame_may_have_another_camera_and_size(stage: int) -> None:
     term, there = begun(*at_truth(cut, replace(detections, **masks)), stage)
     of_first = [x.blocks.owner < 2 for x in (whole, term)]
     residuals = [
-        x.linear(s.field, s.state, x.where(s)).residual[rows]
-        for x, s, rows in ((whole, sight, of_first[0]), (term, there, of_first[1]))
+        x.linear(s.field, s.state, x.anchor(s)).residual[rows]
+        for x, s, rows in ((whole, prepared, of_first[0]), (term, there, of_first[1]))
     ]
     torch.testing.assert_close(residuals[1], residuals[0])
     assert torch.equal(term.row_weight[of_first[1]], whole.row_weight[of_first[0]])
@@ -213,9 +215,9 @@ def test_what_images_change_is_differentiable(brightness: Brightness) -> None:
         changed = replace(frames, images_left=frames.images_left + 0.02 * by * noise)
         problem, state = at_truth(changed, detections, config=config)
         with torch.no_grad():
-            sight = problem.look(state)
+            prepared = problem.prepare(state)
         # The state at which a stage begins is a constant.
-        stage = problem.begin(1, sight)
+        stage = problem.begin(1, prepared)
         return stage.linearise_differentiably(disturbed(state)).gradient.square().sum()
 
     by = torch.zeros((), dtype=torch.float64, requires_grad=True)
@@ -228,17 +230,17 @@ def test_what_images_change_is_differentiable(brightness: Brightness) -> None:
 
 def test_cars_keep_their_rows_when_others_leave() -> None:
     problem, state = at_truth(*drive())
-    term, sight = begun(problem, state)
+    term, prepared = begun(problem, state)
     keep = torch.tensor([False, True, False, True, True, False])
     cars = Chosen.where(keep)
     numbers = list(cars.numbers)
     fewer = term.of(cars)
     blocks = keep[term.blocks.owner]
     there = TrackState(*(x[numbers] for x in state))
-    where = type(term.where(sight))(*(x[..., blocks, :] for x in term.where(sight)))
+    anchor = type(term.anchor(prepared))(*(x[..., blocks, :] for x in term.anchor(prepared)))
     field = field_of(problem.prior.bind(state.code))
-    residual = term.linear(field, state, term.where(sight)).residual[blocks]
-    of_fewer = fewer.linear(field_of(problem.prior.bind(there.code)), there, where).residual
+    residual = term.linear(field, state, term.anchor(prepared)).residual[blocks]
+    of_fewer = fewer.linear(field_of(problem.prior.bind(there.code)), there, anchor).residual
     torch.testing.assert_close(of_fewer, residual, rtol=1e-9, atol=1e-9)
     # Before a stage begins too.
     whole = problem.evidence[0].of(cars)

@@ -67,7 +67,7 @@ def test_a_car_may_turn_back() -> None:
     modulo = (path[:, 6] - turning[6] + math.pi / 2) % math.pi - math.pi / 2
     torch.testing.assert_close(modulo, torch.zeros(5, dtype=torch.float64))
     torch.testing.assert_close(path[:, 7], turning[7].expand(5))
-    assert hold_of_path(CONFIG, sharing, cars, state, sharing.everybody).tolist() == [1.0] * 5
+    assert hold_of_path(CONFIG, sharing, cars, state, sharing.all_members).tolist() == [1.0] * 5
     # With its acceleration the path itself is where the car is.
     place, _ = motion_terms(CONFIG, cars)
     assert place.residual_of(cars, state._replace(path=turning.expand(5, 9))).residual.abs().max() < 1e-9
@@ -214,7 +214,7 @@ def test_a_track_that_jumps_or_heads_elsewhere_is_held_by_next_to_nothing(
     T_cam_obj = se3.inverse(state.T_obj_cam)
     T_cam_obj[2:, 0, 3] += jump_m
     state = CarState.of(se3.inverse(T_cam_obj), random(5, 3))
-    assert hold_of_path(CONFIG, sharing, timed(sharing, cars), state, sharing.everybody).tolist() == [hold] * 5
+    assert hold_of_path(CONFIG, sharing, timed(sharing, cars), state, sharing.all_members).tolist() == [hold] * 5
 
 
 @pytest.mark.parametrize(("trusted", "hold"), [((0, 1, 2, 3, 4), 1e-4), ((0, 1, 3, 4), 1.0), ((), 1e-4)])

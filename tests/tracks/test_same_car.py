@@ -112,10 +112,10 @@ def unlike(change: str | None = None) -> Tensor:
     evidence = NextViewEvidence(1.0, stereo, NextViews.of(stereo.cars, NEXT))
     views = TrackState.of(state)._replace(T_obj_next=state.T_obj_cam[NEXT][:, None])
     problem = replace(problem, evidence=(evidence,))
-    sight = problem.look(views)
-    (begun,) = problem.begin(-1, sight).terms
+    prepared = problem.prepare(views)
+    (begun,) = problem.begin(-1, prepared).terms
     assert isinstance(begun, NextView)
-    return unlikeness(begun, is_cut_off(stereo), sight, NEXT)
+    return unlikeness(begun, is_cut_off(stereo), prepared, NEXT)
 
 
 @pytest.mark.parametrize(

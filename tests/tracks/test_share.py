@@ -28,7 +28,7 @@ from torch import Tensor
 
 from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.errors import InputError
-from directshape_torch.refinement import outcome
+from directshape_torch.refinement import make_result
 from directshape_torch.refinement import refined as refinements
 from directshape_torch.refinement.problem import CarMinimum, CarProblem
 from directshape_torch.refinement.result import RefinementResult
@@ -216,7 +216,7 @@ def doubt(monkeypatch: pytest.MonkeyPatch, *in_track: int, alone: int | None = N
     def judged(
         minimum: CarMinimum[AnyState], initial: AnyState, *args: Any
     ) -> tuple[CarMinimum[AnyState], RefinementResult]:
-        minimum, found = outcome.judged(minimum, initial, *args)
+        minimum, found = make_result.judged(minimum, initial, *args)
         sizes.append(len(minimum.status))
         rows = in_track if isinstance(minimum.stage.problem.sharing, Groups) else (alone,)
         if len(minimum.status) != num_rows:

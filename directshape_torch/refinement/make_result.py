@@ -54,7 +54,7 @@ _LEAST_IS_THERE = 0.5
 _LARGEST_DEPTH_SHARE = 0.2
 
 
-def as_they_came(
+def unrefined_result(
     prior: ShapePrior, frames: FrameBatch, detections: Detections, status_code: Tensor, term_names: tuple[str, ...]
 ) -> RefinementResult:
     """The result of B cars of which only the input and the statuses (B,) are known."""
@@ -131,10 +131,10 @@ def at_states(result: RefinementResult, state: State) -> RefinementResult:
     )
 
 
-def outcome_of(
-    problem: CarProblem, minimum: CarMinimum[AnyState], cars: CarBatch, came: RefinementResult
+def result_of(
+    problem: CarProblem, minimum: CarMinimum[AnyState], cars: CarBatch, unrefined: RefinementResult
 ) -> RefinementResult:
-    """The result `came` with costs, covariance, quality, observability and profile of a minimum.
+    """The result `unrefined` with costs, covariance, quality, observability and profile of a minimum.
 
     All figures belong to the states where the iterations ended. For cars that get their input back a result keeps only
     the costs of the input.
@@ -146,13 +146,13 @@ def outcome_of(
     # The other views of a track add what they say of its shape.
     information = problem.sharing.with_others(after.information.sum(dim=1), refined)
     covariance = covariance_of(information)[:, kept, kept] + _of_field(end, cars)
-    at_input, at_end = (None if at is None else at.where for at in map(stage.photometric_part, (before, after)))
+    at_input, at_end = (None if at is None else at.anchor for at in map(stage.photometric_part, (before, after)))
     seen = stage.information_of_measurements(after)
     if seen is not None:
         seen = without_offset(problem.sharing.with_others(seen, refined), kept)
     unseen = observability_of(problem.prior, end, seen)
     found = replace(
-        came,
+        unrefined,
         status_code=minimum.status,
         iterations=minimum.iterations,
         cost_history=minimum.cost_history,
@@ -169,7 +169,7 @@ def outcome_of(
     # Views of a track are not combined with their detections.
     chance = chances(of_images, comparison, brings_together=problem.sharing is INDEPENDENT)
     apart, distance = found.profile.halves_apart, comparison.distance_in_sigmas
-    quality = fit_quality(stage, after, minimum.seen_end, apart, distance, chance)
+    quality = fit_quality(stage, after, minimum.prepared_end, apart, distance, chance)
     return _placed(replace(found, comparison=comparison, quality=quality), end)
 
 
