@@ -237,7 +237,9 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("exp", "torch.bmm(X2, X)", "(torch.bmm(X, X2))", "powers of one matrix commute"),
     Equivalent("GridShape.value_and_derivatives", "nothing_is_differentiated()", None, "only its truth is asked for"),
     Equivalent("SilhouetteProducts.linear", "nothing_is_differentiated()", None, "only its truth is asked for"),
-    Equivalent("near_surface", "where.depth", "(-where.depth)", "a hit is tracked from its point, not from its depth"),
+    Equivalent(
+        "near_surface", "anchor.depth", "(-anchor.depth)", "a hit is tracked from its point, not from its depth"
+    ),
     Equivalent("near_surface", "-1.0", "(1.0)", "of rays without a surface, whose quotient nobody asks for"),
     Equivalent("depth_of", "-1.0", "(1.0)", "of rays without a surface, whose quotient nobody asks for"),
     *(
