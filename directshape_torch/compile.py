@@ -187,7 +187,8 @@ def with_varying(table: _T) -> _T:
         if isinstance(value, tuple) or not is_table(value):
             return value
         copy = object.__new__(type(value))
-        vars(copy).update({name: walked(getattr(value, name), spec) for name, spec in declared(value).items()})
+        marked = {name: walked(getattr(value, name), spec) for name, spec in declared(value).items()}
+        vars(copy).update(vars(value) | marked)
         return copy
 
     walked = _walker(lambda tensor, spec: _with_marks(tensor, varying_axes(spec)), of_other)

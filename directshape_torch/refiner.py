@@ -151,10 +151,11 @@ class DirectShapeRefiner(nn.Module):
     def weighs_detector(self) -> bool:
         """Whether results are combined with the detector's boxes.
 
-        Standard deviations in the settings are a prior of the energy, so the box must not count a second time.
+        Standard deviations in the settings are a prior of the energy, so the box must not count a second time. Where
+        points are fitted, nobody has measured what results are off by.
         """
         priors = self.config.priors
-        return priors.detector_weight > 0 and not any(priors.pose_sigmas)
+        return priors.detector_weight > 0 and not any(priors.pose_sigmas) and not self.config.fits_points
 
     @property
     def detector_sigmas(self) -> Tensor | None:

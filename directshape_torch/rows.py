@@ -59,10 +59,10 @@ class OcclusionMap:
     pixels, for other instances.
     """
 
-    # (B, 6) integer, for each object: u0, v0, u1, v1 of the box around all masks, half open; the entry of `covering`
-    # that pixel (0, 0) of the frame would have; the number of entries from one row of pixels to the next
+    # (N, 6) integer, for each detection of the call: u0, v0, u1, v1 of the box around all masks, half open; the entry
+    # of `covering` that pixel (0, 0) of the frame would have; the number of entries from one row of pixels to the next
     crop: Tensor
-    in_front: Tensor  # (B, 2) numbers below which an instance is in front of each object
+    in_front: Tensor  # (N, 2) numbers below which an instance is in front of each detection
     covering: Tensor  # (A, 2) least numbers of the instances that cover each pixel, infinity where none does
 
     def at(

@@ -21,7 +21,7 @@ BUNDLED_CONFIGS = ("default", "paper", "fast", "geometric", "combined")
 # Each of these keys of earlier versions has something else in its place.
 _ALTERNATION = "each round is two entries of stages, as in the settings geometric"
 _GONE = {
-    "method": "choose --config geometric or combined, or give silhouette, photometric and point_cloud their weights",
+    "method": "leave it out for direct; else choose --config geometric or combined, or run scripts/align_boxes.py",
     "point_cloud.order": _ALTERNATION,
     "point_cloud.rounds": _ALTERNATION,
     "point_cloud.max_iterations": _ALTERNATION,

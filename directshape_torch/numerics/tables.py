@@ -17,6 +17,7 @@ from typing import Any, Protocol, Self, TypeVar, get_type_hints
 import torch
 from torch import Tensor
 
+from directshape_torch.errors import InputError
 from directshape_torch.numerics.records import Dense, dense_of
 
 _T = TypeVar("_T")
@@ -97,8 +98,12 @@ def declared(table: object) -> dict[str, Dense | None]:
 @cache
 def _declared_by(kind: type) -> dict[str, Dense | None]:
     names = [each.name for each in fields(kind)] if is_dataclass(kind) else getattr(kind, "_fields", ())
-    hints = get_type_hints(kind, include_extras=True) if names else {}
-    return {name: dense_of(hints[name]) for name in names}
+    try:
+        hints = get_type_hints(kind, include_extras=True) if names else {}
+    except NameError as error:
+        cure = "import the types of its fields at the top of the module, outside of TYPE_CHECKING"
+        raise InputError(kind.__name__, "fields whose types are known at run time", str(error), cure) from error
+    return {name: dense_of(hints.get(name)) for name in names}
 
 
 def varying_axes(spec: Dense | None) -> list[int]:

@@ -176,8 +176,8 @@ class CarStage:
             terms, rest = self._iterated_terms(), None
             anchors = tuple(term.anchor(prepared) for term in terms)
         else:
-            moving = [term.changing_rows(prepared, self.after_wider) for term in self._iterated_terms()]
-            terms, anchors, costs = (tuple(x) for x in zip(*moving, strict=True))
+            changing = [term.changing_rows(prepared, self.after_wider) for term in self._iterated_terms()]
+            terms, anchors, costs = (tuple(x) for x in zip(*changing, strict=True))
             by_column = torch.cat(costs, dim=1)
             rest = (by_column if problem.factors is None else by_column * problem.factors).sum(dim=1)
         # Rays are marched again only where nothing is known to rest.

@@ -40,7 +40,7 @@ class Refined(Generic[AnyState]):
             cars: the B cars.
             initial: input states.
             start: where the iterations begin.
-            came: what is known of the cars before the minimisation.
+            unrefined: what is known of the cars before the minimisation.
         """
         repeats_steps = torch.is_grad_enabled() and problem.config.backward.mode == "unroll"
         with torch.no_grad():

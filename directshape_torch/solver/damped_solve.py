@@ -106,5 +106,5 @@ def general_solution(
     regular = (info == 0) & matrix.flatten(1).isfinite().all(dim=1)
     # Where there is no solution the system is replaced, so that no NaN passes into gradients.
     identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    anchor = regular.view(-1, 1, 1)
-    return torch.linalg.solve(torch.where(anchor, matrix, identity), torch.where(anchor, right, 0.0)), regular
+    is_regular = regular.view(-1, 1, 1)
+    return torch.linalg.solve(torch.where(is_regular, matrix, identity), torch.where(is_regular, right, 0.0)), regular

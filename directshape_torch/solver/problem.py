@@ -48,7 +48,7 @@ class EnergyAt(Protocol):
 
 
 PreparedT = TypeVar("PreparedT")
-SightT_contra = TypeVar("SightT_contra", contravariant=True)
+PreparedT_contra = TypeVar("PreparedT_contra", contravariant=True)
 EvaluationT = TypeVar("EvaluationT", bound=EnergyAt)
 
 
@@ -93,14 +93,14 @@ class Iterations(Protocol[StateT, EvaluationT]):
         ...
 
 
-class Stage(Protocol[StateT, SightT_contra, EvaluationT, FiguresT_co]):
+class Stage(Protocol[StateT, PreparedT_contra, EvaluationT, FiguresT_co]):
     """A `Stage` of all problems has begun: everything is fixed that must not change while costs compare."""
 
-    def start(self, prepared: SightT_contra) -> tuple[Iterations[StateT, EvaluationT], EvaluationT]:
+    def start(self, prepared: PreparedT_contra) -> tuple[Iterations[StateT, EvaluationT], EvaluationT]:
         """The iterations, and the evaluation of the state where they begin."""
         ...
 
-    def figures(self, prepared: SightT_contra) -> FiguresT_co:
+    def figures(self, prepared: PreparedT_contra) -> FiguresT_co:
         """The figures of a state from `prepare`."""
         ...
 

@@ -224,7 +224,7 @@ def schur_complement(
 
     Examples:
         >>> matrix, gradient = torch.tensor([[[4.0, 2.0], [2.0, 2.0]]]), torch.tensor([[4.0, 0.0]])
-        >>> said_of_shared(matrix, gradient, own=torch.tensor([0]), shared=torch.tensor([1]))
+        >>> schur_complement(matrix, gradient, own=torch.tensor([0]), shared=torch.tensor([1]))
         (tensor([[[1.]]]), tensor([[2.]]), tensor([True]))
     """
     both = torch.cat([gradient[:, :, None], matrix[:, :, shared]], dim=2)

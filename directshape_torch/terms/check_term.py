@@ -67,13 +67,13 @@ def check_term(
     begun = term.begin(stage, prepared)
     _check_rows(f"{called} after begin(...)", begun, num_cars)
     _check_linear(f"{called}: linear(...)", begun, begun.anchor(prepared), prepared.field, prepared.state)
-    moving, anchor, resting = begun.changing_rows(prepared, False)
-    _check_rows(f"{called} after changing_rows(...)", moving, num_cars)
-    _check_linear(f"{called} after changing_rows(...): linear(...)", moving, anchor, prepared.field, prepared.state)
+    changing, anchor, resting = begun.changing_rows(prepared, False)
+    _check_rows(f"{called} after changing_rows(...)", changing, num_cars)
+    _check_linear(f"{called} after changing_rows(...): linear(...)", changing, anchor, prepared.field, prepared.state)
     check_shape(
         f"{called}: the cost of changing_rows(...)", resting, (num_cars, len(names)), "one for each car and name"
     )
-    before = car_products(moving, prepared.field, prepared.state, anchor)
+    before = car_products(changing, prepared.field, prepared.state, anchor)
     # The remaining cars are every other car, the last car, or none; in the first two cases all cars get new numbers.
     for numbers in dict.fromkeys((tuple(range(1, num_cars, 2)), tuple(range(num_cars))[-1:], ())):
         if len(numbers) < num_cars:
@@ -81,7 +81,7 @@ def check_term(
             keep[list(numbers)] = True
             left, few = f"{called} after of(cars)", of(prepared.state, Chosen(keep, numbers))
             with named_errors(left, len(numbers)):
-                now = _products_of(Chosen(keep, numbers), moving, anchor, few, field_at(few.code))
+                now = _products_of(Chosen(keep, numbers), changing, anchor, few, field_at(few.code))
             check_same(left, now, before, numbers)
 
 
@@ -136,7 +136,8 @@ def _check_fields(called: str, table: object, sizes: Mapping[int | str, int]) ->
     for name, part in parts.items():
         spec = specs.get(str(name))
         if is_table(part) and spec is None:
-            _check_fields(called, part, sizes)
+            blocks = getattr(part, "blocks", None)
+            _check_fields(called, part, {**sizes, "M": len(blocks.owner)} if isinstance(blocks, Blocks) else sizes)
         elif isinstance(part, Tensor) and spec is None:
             raise InputError(f"{called}: {name}", "a declaration of its axes", "none", _DECLARE)
         elif isinstance(part, Tensor) and spec is not None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Annotated, NamedTuple, Self
 
 import torch
@@ -112,7 +113,7 @@ class MaskRows(Table):
             counts[:num_cars],
         ), places
 
-    @property
+    @cached_property
     def of_sides(self) -> tuple[Rays, Rays]:
         """The rays of the left image, and the rays of the right image."""
         blocks = torch.arange(len(self.side), device=self.side.device)

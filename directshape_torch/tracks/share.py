@@ -50,7 +50,7 @@ def brought_together(
         problem: the problem of these cars, each refined alone.
         cars: the cars, with their tracks.
         initial: input states.
-        came: what is known of the cars beforehand.
+        unrefined: what is known of the cars beforehand.
     """
     for name in (name for name in (*MOTION_NAMES, NEXT_VIEW_NAME) if name in problem.term_names):
         cure = "give the term another name"
@@ -190,12 +190,12 @@ class Views:
 
 def _linked(problem: CarProblem, sharing: Groups, views: CarBatch, alone: CarState, next_view: Tensor) -> TrackState:
     state = TrackState.of(alone)
-    if _looks_at_next(problem):
+    if _has_next_view(problem):
         state = state._replace(T_obj_next=state.T_obj_cam[next_view][:, None])
     return with_path(problem.config.tracks, sharing, views, state)
 
 
-def _looks_at_next(problem: CarProblem) -> bool:
+def _has_next_view(problem: CarProblem) -> bool:
     return problem.config.tracks.next_view_weight > 0 and _photometric(problem) is not None
 
 
@@ -228,7 +228,7 @@ def in_tracks(
         hold = hold_of_path(config.tracks, sharing, views, alone, trusted)
         columns = [hold, 1 / sharing.total(one, sharing.all_members)]
     stereo = _photometric(problem)
-    if stereo is not None and _looks_at_next(problem):
+    if stereo is not None and _has_next_view(problem):
         added.append(NextViewEvidence(config.tracks.next_view_weight, stereo, NextViews.of(views, next_view)))
         columns.append(one)
     before = sum(len(each.names) for each in problem.evidence)

@@ -35,7 +35,7 @@ from directshape_torch.terms.priors import PriorTerm
 from directshape_torch.terms.silhouette import Silhouettes
 
 _REST = "everything else"
-_OUTCOME = "outcome: covariance, quality, profile, trust"
+_RESULT = "result: covariance, quality, profile, trust"
 # The functions themselves are listed, so that removing one makes its line fail.
 PARTS: dict[str, tuple[Any, ...]] = {
     "observation: regions, occlusion, pixels": (DirectShapeRefiner._observe, problem_of_scene),
@@ -50,7 +50,7 @@ PARTS: dict[str, tuple[Any, ...]] = {
     "solve and step": (damped_step, Unknowns.retract),
     "iterations, the rest": (iterate, CarIterations.choose, CarIterations.of, CarIterations.evaluation_of),
     "figures at the end": (CarStage.figures,),
-    _OUTCOME: (result_of,),
+    _RESULT: (result_of,),
 }
 
 
@@ -101,7 +101,7 @@ class _Recorder:
         self.risen[self._stack[-1]] += self._reading() - self._last  # type: ignore[assignment]
         if event == "call":
             caller = self._stack[-1]
-            self._stack.append(caller if caller == _OUTCOME else self._parts.get(frame.f_code, caller))
+            self._stack.append(caller if caller == _RESULT else self._parts.get(frame.f_code, caller))
         elif len(self._stack) > 1:  # functions that were running before the hook was set return too
             self._stack.pop()
         self._last = self._reading()
