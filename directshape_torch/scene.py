@@ -201,6 +201,9 @@ class Detections(TensorRecord):
         track_id: (B,) int64 or int32: detections of one number are views of one car in several frames, which get one
             shape (docs/tracks.md); a number below 0 is a car by itself. None means that every car is by itself.
         convention: how the boxes were written before they became poses and dimensions; messages use its words.
+        is_from_masks: (B,) bool, boxes that were made of the images' own disparities (`from_masks`) and not by a
+            detector. They are no evidence of the rig or of a detector, and results are not compared with them. None
+            means that a detector made every box; when collated with frames that have values, False replaces None.
 
     Raises:
         InputError: wrong shapes or types, a matrix that is no rotation, dimensions or standard deviations that are not
@@ -223,6 +226,7 @@ class Detections(TensorRecord):
     offset_sigma_px: Annotated[Tensor | None, Dense("B")] = None
     track_id: Annotated[Tensor | None, Dense("B", kind="index")] = None
     convention: BoxFormat = "kitti"
+    is_from_masks: Annotated[Tensor | None, Dense("B", kind="flags")] = None
 
     def __post_init__(self) -> None:
         _cut_masks(self)
@@ -331,6 +335,55 @@ class Detections(TensorRecord):
             track_id=as_index(track_id, like),
             convention=convention,
         )
+
+    @classmethod
+    def from_masks(
+        cls,
+        frames: FrameBatch,
+        mask_left: Masks,
+        mask_right: Masks | None = None,
+        frame_index: Given | None = None,
+        score: Given | None = None,
+    ) -> Detections:
+        """Detections of instance masks alone: rough boxes are made of the disparity under each left mask.
+
+        A mean car's rectangle is fitted to the stereo points of each mask, seen from above, from all headings. The
+        ground plane gives the height. Which end of a car is its front is not known from this: the heading is known
+        modulo half a turn, and each car is taken to be seen from behind, as most are. A mask that shows too
+        little disparity, or nothing of a car's size on the road, gets a pose of NaN and, from a refiner, the status
+        `no_start`.
+
+        The boxes are made of the same disparities that a rig would be checked with, so they are no evidence of it
+        (`is_from_masks`): frames need a camera whose disparity is right, or a known `disparity_field`.
+
+        Args:
+            frames: F frames; frames with a disparity of their own are not matched.
+            mask_left, mask_right: B masks as in `from_boxes`; right masks add information.
+            frame_index: (B,) default all 0.
+            score: (B,) default all 1.
+
+        Raises:
+            InputError: masks of another size than the frames, other numbers of masks, or frames that do not exist.
+        """
+        # The import stands here, because only users without a detector need it, and it knows scenes.
+        from directshape_torch.start.from_masks import start_boxes
+
+        like = frames.images_left
+        left = MaskCrops.of(mask_left, name="mask_left").to(like.device)
+        count, size_hw = len(left), (like.shape[2], like.shape[3])
+        right = (
+            MaskCrops.none(count, left.size_hw, left.values)
+            if mask_right is None
+            else MaskCrops.of(mask_right, name="mask_right").to(like.device)
+        )
+        _check_mask_numbers(left, right, count)
+        for name, masks in (("mask_left", left), ("mask_right", right)):
+            if masks.size_hw != size_hw:
+                raise InputError(name, f"masks of the (padded) image size {size_hw}", f"{masks.size_hw}")
+        index = like.new_zeros(count, dtype=torch.long) if frame_index is None else as_index(frame_index, like)
+        check_shape("frame_index", index, (count,), "one for each mask", kind="index")
+        scores = like.new_ones(count) if score is None else as_floating(score, like)
+        return start_boxes(frames, left, right, index, scores)
 
     @property
     def has_mask_left(self) -> Tensor:

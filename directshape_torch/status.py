@@ -46,6 +46,10 @@ class Status(enum.Enum):
         "a car's is; check that mask and box are of one car, or set both probabilities of `acceptance` to 0 to have it "
         "all the same"
     )
+    no_start = (
+        "no box could be made of the mask: under it are too few disparities, or nothing of a car's size on the road; "
+        "check that mask and images are of one frame, and the ground plane, or give a box of a detector"
+    )
 
     @property
     def code(self) -> int:

@@ -227,6 +227,8 @@ def run_manifest(dataset: StereoDataset, refiner: DirectShapeRefiner, batch_fram
         "camera_height_m": dataset.camera_height_m,
         "dtype": str(refiner.prior.origin.dtype).removeprefix("torch."),
     }
+    if not dataset.has_detections:
+        settings["boxes"] = "masks"
     if has_tracks(dataset):
         settings["track_frames"] = batch_frames
     if (sigmas := refiner.detector_sigmas) is not None:
@@ -257,8 +259,8 @@ def check_out_dir(dataset: StereoDataset, out_dir: Path) -> None:
     for link in (out_dir / name for name in OUTPUT_FOLDERS if (out_dir / name).is_symlink()):
         cure = "remove the link; the output folder itself may be one"
         raise InputError("out", "folders of its own in it, where results are written and removed", f"link {link}", cure)
-    written = (out_dir / "data").resolve()
-    for read in (dataset.layout.detections_dir, dataset.layout.detections_dir / "data"):
+    written, folder = (out_dir / "data").resolve(), dataset.layout.detections_dir
+    for read in () if folder is None else (folder, folder / "data"):
         if written == read.resolve():
             raise InputError(
                 "out", "a folder other than that of the detections", str(out_dir), "it would overwrite its own input"

@@ -25,11 +25,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="KITTI labels, NNNNNN.txt, or of tracking: SEQUENCE.txt, or one file, or a plain folder",
     )
-    for name, what in (("before", "result files that went in"), ("after", "result files that came out")):
-        parser.add_argument(
-            f"--{name}", type=Path, required=True, metavar="DIR", help=f"{what} (or DIR/data), in the same forms"
-        )
-    add_frame_choice(parser, "all of --before")
+    parser.add_argument(
+        "--before",
+        type=Path,
+        metavar="DIR",
+        help="result files that went in (or DIR/data), in the same forms; without them only --after is measured, as "
+        "for boxes made of masks",
+    )
+    parser.add_argument(
+        "--after", type=Path, required=True, metavar="DIR", help="result files that came out (or DIR/data)"
+    )
+    add_frame_choice(parser, "all of --before, else of --after")
     parser.add_argument("--shapes", type=Path, metavar="DIR", help="OUT/shapes, or OUT: count only cars with a mask")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all groups")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write one line for each detection")

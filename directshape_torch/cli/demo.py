@@ -1,7 +1,8 @@
 """`directshape demo`: refine the bundled stereo frame.
 
-Refine the bundled stereo frame, a path-traced street with the project's own cars, from noisy detections; print the
-errors before and after, and write the results, a picture and a 3D scene (scene.glb) for any glTF viewer.
+Refine the bundled stereo frame, a path-traced street with the project's own cars, from noisy detections or from masks
+alone; print the errors before and after, and write the results, a picture and a 3D scene (scene.glb) for any glTF
+viewer.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset, open
 DEMO_FOLDER = Path(__file__).parent.parent / "assets" / "demo"
 
 
-def demo_dataset(frames: Iterable[int | str] | None = None) -> StereoDataset:
-    """The bundled frame with noisy detections."""
-    folder = DEMO_FOLDER
-    return open_dataset("kitti", folder, folder / "detections/noisy_stereo", folder / "training/masks", frames=frames)
+def demo_dataset(frames: Iterable[int | str] | None = None, from_masks: bool = False) -> StereoDataset:
+    """The bundled frame with noisy detections, or with boxes that are made of its masks."""
+    folder, detections = DEMO_FOLDER, DEMO_FOLDER / "detections/noisy_stereo"
+    return open_dataset("kitti", folder, None if from_masks else detections, folder / "training/masks", frames=frames)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -44,6 +45,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for the results (default: %(default)s)",
     )
+    parser.add_argument("--from-masks", action="store_true", help="make the boxes of masks and disparity alone")
     parser.add_argument("--fresh", action="store_true", help="remove the results that runs have left in DIR")
     add_config_option(parser)
     add_device_option(parser)
@@ -51,7 +53,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Refine the bundled frame in the same way as `directshape refine`, then report."""
-    dataset = demo_dataset()
+    dataset = demo_dataset(from_masks=args.from_masks)
     refiner = make_refiner(args.config, [], "pca", args.device)
     # If other programs share the cores, several threads wait for each other, which makes one frame take minutes.
     with ProgressBar() as progress, limited_threads(1):

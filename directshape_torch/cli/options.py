@@ -35,10 +35,13 @@ def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = T
     """Add `--data`, `--layout`, `--detections`, masks, choice of frames and classes, ground and `--rig`."""
     add_layout_options(group, required)
     group.add_argument(
-        "--detections", type=Path, metavar="DIR", help="NNNNNN.txt in DIR or DIR/data (folder: default ROOT/frames)"
+        "--detections",
+        type=Path,
+        metavar="DIR",
+        help="NNNNNN.txt in DIR or DIR/data (folder: default ROOT/frames); without them boxes are made of the masks",
     )
     add_mask_options(group)
-    group.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line; default: all detection files")
+    group.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line; default: all with detections")
     add_rig_option(
         group,
         "a file of 'directshape calibrate-rig' or of a run corrects the stereo rig; auto: refine estimates it; "
@@ -227,8 +230,10 @@ def dataset_of_run(args: argparse.Namespace, run: RunFolder) -> StereoDataset | 
     return open_dataset(
         args.layout,
         args.data,
-        # A layout needs a folder of detections, so the result files take their place if none is given.
-        run.path if args.detections is None and args.layout != "folder" else args.detections,
+        # The result files take the place of detections that are not given, unless the boxes were made of the masks.
+        run.path
+        if args.detections is None and args.layout != "folder" and not _is_of_masks(args, run)
+        else args.detections,
         mask_source(args),
         frames=run.frame_ids,
         classes=run.classes,
@@ -244,6 +249,11 @@ def inputs_of_run(args: argparse.Namespace, run: RunFolder) -> RunInputs:
     dataset = dataset_of_run(args, run) if run.frame_ids else None
     has_detections = args.layout == "folder" or args.detections is not None
     return RunInputs(run, prior_of_run(args.prior, run), dataset, has_detections)
+
+
+def _is_of_masks(args: argparse.Namespace, run: RunFolder) -> bool:
+    """Whether the run's boxes were made of masks, which are given."""
+    return run.manifest.config.get("boxes") == "masks" and mask_source(args) is not None
 
 
 def prior_of_run(source: str | None, run: RunFolder) -> ShapePrior | None:

@@ -122,7 +122,7 @@ def run(args: argparse.Namespace) -> int:
         refiner.rig = RigEstimates(rigs)
         if not refiner.config.fits_points:
             _say_where_rigs_are_guesses(rigs)
-        if refiner.weighs_detector:
+        if refiner.weighs_detector and dataset.has_detections:
             with limited_threads(options.threads):
                 _learn(dataset, refiner, refiner.rig)
     with _Progress(args.out, rigs if are_new else None) as progress:
@@ -169,6 +169,10 @@ def _rigs_of_run(dataset: StereoDataset, rig: str, out_dir: Path, fresh: bool) -
         for estimate in kept:
             print(f"{estimate} (kept)")
         return kept, False
+    if not dataset.has_detections:
+        said = "note: boxes made of masks tell nothing of the rig, so cameras may be off by rig.disparity_sigma_px"
+        print(f"{said}: give --rig FILE, or detections (docs/no_boxes.md)", file=sys.stderr)
+        return [], False
     with Bar(desc="rig", unit="frame") as bar:
         rigs = estimate_rigs(dataset, lambda _: bar.update())
     for estimate in rigs:

@@ -79,6 +79,8 @@ def check_frames(
         tell(frame_id)
     words = words_of_files(dataset.layout.files(dataset.frame_ids[0]).calibration)
     nothing = "no detection of the chosen classes with a 3D box"
+    if not dataset.has_detections:
+        nothing, num_cars = "no mask of a car in the left images", sum(one.num_masks["left"] for one in evidence)
     of_cars = check_cars(evidence) if num_cars else [found("no_cars", "all frames", nothing, words=words)]
     return [*findings, *of_cars], num_cars
 

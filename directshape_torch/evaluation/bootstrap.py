@@ -29,11 +29,14 @@ class Estimate:
 
 @dataclass(frozen=True)
 class MetricSummary:
-    """A `MetricSummary` is a figure before and after, and its change with an interval from the same draws of cars."""
+    """A `MetricSummary` is a figure before and after, and its change with an interval from the same draws of cars.
 
-    before: Estimate
+    Before and change are None where nothing went in that could be measured.
+    """
+
+    before: Estimate | None
     after: Estimate
-    change: Estimate
+    change: Estimate | None
 
 
 class CarBootstrap:

@@ -38,7 +38,7 @@ class ComparedCar:
     depth_m: float  # of the label's box along the optical axis, metres
     height_px: float  # of the label's 2D box
     score: float | None  # confidence of the detector, or None
-    before: CarErrors  # errors of both boxes
+    before: CarErrors | None  # errors of both boxes; None where no boxes went in
     after: CarErrors
 
 
@@ -60,7 +60,11 @@ METRICS = (
     Metric("centre_bev_m_median", "centre error BEV, median", "m", lambda e: e.centre_bev_m, np.median),
     Metric("yaw_deg_median", "yaw error mod 360, median", "deg", lambda e: e.yaw_deg, np.median),
     Metric("yaw_axis_deg_median", "yaw error mod 180, median", "deg", lambda e: e.yaw_axis_deg, np.median),
+    Metric("yaw_axis_good_share", "yaw error mod 180 < 20 deg", "%", lambda e: float(e.yaw_axis_deg < 20), np.mean),
 )
+# A line without a 3D box is as wrong as can be. It is this many metres off, as KITTI's columns of no box are.
+_FAR_M = 1000.0
+_NO_BOX = CarErrors(_FAR_M, _FAR_M, 180.0, 90.0, 0.0, 0.0, _FAR_M, _FAR_M, _FAR_M)
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,8 @@ class GroupSummary:
     name: str  # of the group
     num_detections: int  # number of compared detections
     metrics: dict[str, MetricSummary]  # by `Metric.key`; empty for an empty group
-    worse_share: Estimate | None  # share of detections whose BEV IoU fell by more than 0.05; None for an empty group
+    # Share of detections whose BEV IoU fell by more than 0.05; None for an empty group, and where no boxes went in.
+    worse_share: Estimate | None
 
 
 @dataclass(frozen=True)
@@ -87,7 +92,7 @@ class Comparison:
 
 def compare_results(
     labels_dir: Path | str,
-    before_dir: Path | str,
+    before_dir: Path | str | None,
     after_dir: Path | str,
     *,
     split: Path | str | None = None,
@@ -102,9 +107,11 @@ def compare_results(
         labels_dir: folder of KITTI labels `NNNNNN.txt` (usually `training/label_2`), or of the tracking benchmark: a
             folder of `SEQUENCE.txt`, for frames with names `SEQUENCE_NNNNNN`, or the file of a single sequence.
         before_dir, after_dir: result files in the same forms, or in a subfolder `data`. The files of a frame have the
-            same lines in the same order. A detection is matched to its label by the 2D box of `before`.
+            same lines in the same order. A detection is matched to its label by the 2D box of `before`. None for
+            `before_dir` means that no boxes went in, but masks: only `after` is measured, and a line without a 3D box
+            counts as one that overlaps nothing.
         split: file with one frame id in each line. Default: every frame of `before_dir`, or every frame of `after_dir`
-            if `before_dir` has files of the tracking benchmark.
+            if `before_dir` is None or has files of the tracking benchmark.
         frames: ids or numbers of the frames to compare, out of the split.
         shapes_dir: `OUT/shapes` of the refinement, or `OUT`. Detections without a left mask and copied lines are then
             left out, although they still take part in the matching.
@@ -114,11 +121,12 @@ def compare_results(
         DataFormatError: a file is missing or damaged, or the two result files of a frame have different lines.
         InputError: there are no frames.
     """
-    sources = Path(labels_dir), Path(before_dir), Path(after_dir)
-    known = _frames_of(*sources[1:])
+    first_dir = after_dir if before_dir is None else before_dir
+    sources = Path(labels_dir), None if before_dir is None else Path(before_dir), Path(after_dir)
+    known = _frames_of(Path(first_dir), Path(after_dir))
     if not known:
-        raise InputError("frames", f"at least one frame; result files NNNNNN.txt in {before_dir}", "none")
-    frame_ids = chosen_frames(known, frames, split, f"frames of {before_dir}")
+        raise InputError("frames", f"at least one frame; result files NNNNNN.txt in {first_dir}", "none")
+    frame_ids = chosen_frames(known, frames, split, f"frames of {first_dir}")
     cars: list[ComparedCar] = []
     if shapes_dir is not None and (below := Path(shapes_dir) / "shapes").is_dir():
         shapes_dir = below
@@ -155,12 +163,16 @@ def _summarised(name: str, cars: Sequence[ComparedCar], num_draws: int, seed: in
     # The order by label makes the draws independent of the order of the detections.
     cars = sorted(cars, key=lambda car: f"{car.frame_id}:{car.label_line}")
     bootstrap = CarBootstrap(len(cars), num_draws, seed)
-    metrics = {}
+    metrics, compared = {}, [(car.before, car.after) for car in cars if car.before is not None]
     for metric in METRICS:
-        before, after = (np.array([metric.value(getattr(car, when)) for car in cars]) for when in ("before", "after"))
-        metrics[metric.key] = bootstrap.summary(before, after, metric.statistic)
-    worse = np.array([car.after.bev_iou < car.before.bev_iou - WORSE_BY for car in cars], dtype=np.float64)
-    return GroupSummary(name, len(cars), metrics, bootstrap.estimate(worse))
+        after = np.array([metric.value(car.after) for car in cars])
+        if compared:
+            before = np.array([metric.value(errors) for errors, _ in compared])
+            metrics[metric.key] = bootstrap.summary(before, after, metric.statistic)
+        else:
+            metrics[metric.key] = MetricSummary(None, bootstrap.estimate(after, metric.statistic), None)
+    worse = np.array([now.bev_iou < then.bev_iou - WORSE_BY for then, now in compared], dtype=np.float64)
+    return GroupSummary(name, len(cars), metrics, bootstrap.estimate(worse) if compared else None)
 
 
 def _frames_of(before: Path, after: Path) -> tuple[str, ...]:
@@ -178,21 +190,25 @@ def _frames_of(before: Path, after: Path) -> tuple[str, ...]:
     return tuple(frame for name in sorted(sequences | alone) for frame in of_sequence.get(name, [name]))
 
 
-def _cars_of_frame(sources: tuple[Path, Path, Path], frame_id: str) -> tuple[list[ComparedCar], int]:
+def _cars_of_frame(sources: tuple[Path, Path | None, Path], frame_id: str) -> tuple[list[ComparedCar], int]:
     """Counted labels of a frame that have a detection, and the number of all counted labels."""
-    before_path, after_path = (objects_path(source, frame_id) for source in sources[1:])
-    labels = objects_of_frame(sources[0], frame_id, are_labels=True)
+    labels_dir, before_dir, after_dir = sources
+    after_path = objects_path(after_dir, frame_id)
+    labels = objects_of_frame(labels_dir, frame_id, are_labels=True)
     if not after_path.is_file():
         cure = "was it refined? name the frames that were with --frames or --split"
         raise DataFormatError(after_path, f"there is no result of frame {frame_id}", cure=cure)
-    before, after = objects_of_frame(sources[1], frame_id), objects_in(after_path, frame_id)
-    _check_same_lines(before_path, before, after_path, after)
-    lines = [pair for pair in zip(before, after, strict=True) if pair[0].type == "Car" and pair[0].has_box_3d]
+    before = after = objects_in(after_path, frame_id)
+    if before_dir is not None:
+        before = objects_of_frame(before_dir, frame_id)
+        _check_same_lines(objects_path(before_dir, frame_id), before, after_path, after)
+    cars = [pair for pair in zip(before, after, strict=True) if pair[0].type == "Car"]
+    lines = [pair for pair in cars if before_dir is None or pair[0].has_box_3d]
     found = match_to_labels([old for old, _ in lines], labels)
     label_of = {row: label for row, label in found.items() if is_counted(label)}
     sides = ([lines[row][side] for row in label_of] for side in (0, 1))
-    errors = [errors_of(objects, list(label_of.values())) for objects in sides]
-    cars = [
+    errors = [_errors_of(objects, list(label_of.values())) for objects in sides]
+    compared = [
         ComparedCar(
             frame_id=frame_id,
             detection_line=lines[row][0].line_number,
@@ -200,12 +216,17 @@ def _cars_of_frame(sources: tuple[Path, Path, Path], frame_id: str) -> tuple[lis
             depth_m=label.location_ref[2],
             height_px=label.box_2d[3] - label.box_2d[1],
             score=lines[row][0].score,
-            before=before,
-            after=after,
+            before=None if before_dir is None else old,
+            after=new,
         )
-        for (row, label), before, after in zip(label_of.items(), *errors, strict=True)
+        for (row, label), old, new in zip(label_of.items(), *errors, strict=True)
     ]
-    return cars, sum(is_counted(label) for label in labels)
+    return compared, sum(is_counted(label) for label in labels)
+
+
+def _errors_of(objects: Sequence[KittiObject], labels: Sequence[KittiObject]) -> list[CarErrors]:
+    pairs = zip(objects, errors_of(objects, labels), strict=True)
+    return [errors if one.has_box_3d else _NO_BOX for one, errors in pairs]
 
 
 def _check_same_lines(

@@ -38,13 +38,17 @@ def format_comparison(found: Comparison) -> str:
     ]
     if found.num_filtered_out:
         heading.append(f"{found.num_filtered_out} more detections have no left mask and are left out")
-    if overall.worse_share is None:
+    if not overall.num_detections:
         return _text(heading, "nothing to compare: no counted label has a detection")
     rows = [["", "before", "after", "change"]]
     rows += [[m.label, *_with_change(m.unit, overall.metrics[m.key])] for m in comparison.METRICS]
-    rows.append([f"BEV IoU worse by {WORSE_BY}", "", with_interval("%", overall.worse_share), ""])
+    if overall.worse_share is None:
+        rows = [[row[0], row[2]] for row in rows]
+    else:
+        rows.append([f"BEV IoU worse by {WORSE_BY}", "", with_interval("%", overall.worse_share), ""])
     metrics = [metric for metric in comparison.METRICS if metric.key in _GROUP_METRICS]
-    groups = [["group", "n", *(metric.label for metric in metrics), "worse"]]
+    worse = [] if overall.worse_share is None else ["worse"]
+    groups = [["group", "n", *(metric.label for metric in metrics), *worse]]
     groups += [_group_row(group, metrics) for group in (overall, *found.by_depth) if group.num_detections]
     return _text([*heading, _about_intervals(overall.num_detections)], align(rows), align(groups))
 
@@ -53,10 +57,11 @@ def _group_row(group: GroupSummary, metrics: Sequence[Metric]) -> list[str]:
     cells = []
     for metric in metrics:
         summary = group.metrics[metric.key]
-        before, after = (number(metric.unit, e.value) for e in (summary.before, summary.after))
-        cells.append(f"{before.split(' ')[0]} -> {after}")
-    worse = "" if group.worse_share is None else number("%", group.worse_share.value)
-    return [group.name, str(group.num_detections), *cells, worse]
+        after = number(metric.unit, summary.after.value)
+        before = "" if summary.before is None else f"{number(metric.unit, summary.before.value).split(' ')[0]} -> "
+        cells.append(before + after)
+    worse = [] if group.worse_share is None else [number("%", group.worse_share.value)]
+    return [group.name, str(group.num_detections), *cells, *worse]
 
 
 def write_comparison_csv(path: Path | str, cars: Sequence[ComparedCar]) -> None:
@@ -64,7 +69,8 @@ def write_comparison_csv(path: Path | str, cars: Sequence[ComparedCar]) -> None:
     own = [f.name for f in fields(ComparedCar) if f.name not in ("before", "after")]
     rows: list[list[Any]] = [own + [f"{name}_{when}" for name in PoseErrors._fields for when in ("before", "after")]]
     for car in cars:
-        errors = [error for pair in zip(car.before, car.after, strict=True) for error in pair]
+        before = [""] * len(car.after) if car.before is None else car.before
+        errors = [error for pair in zip(before, car.after, strict=True) for error in pair]
         rows.append([*(getattr(car, name) for name in own), *errors])
     write_csv(path, rows)
 
@@ -141,8 +147,9 @@ def write_shape_scores_csv(path: Path | str, cars: Sequence[EvaluatedCar]) -> No
 
 def _with_change(unit: str, summary: MetricSummary) -> list[str]:
     """Before, after and change as cells."""
-    estimates = (summary.before, summary.after)
-    return [*(with_interval(unit, e) for e in estimates), with_interval(unit, summary.change, sign=True)]
+    before = "" if summary.before is None else with_interval(unit, summary.before)
+    change = "" if summary.change is None else with_interval(unit, summary.change, sign=True)
+    return [before, with_interval(unit, summary.after), change]
 
 
 def _about_intervals(num_cars: int) -> str:

@@ -27,7 +27,7 @@ from directshape_torch.io.instance_masks import (
     within_memory,
 )
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera, upright_plane
-from directshape_torch.io.kitti_labels import KittiObject, parse_object
+from directshape_torch.io.kitti_labels import NO_BOX_3D, KittiObject, parse_object
 from directshape_torch.numerics.checks import is_no_rotation
 from directshape_torch.scene import SIDES, Side
 
@@ -36,8 +36,6 @@ _CURE = "see docs/plain_folder.md"
 _Triple = tuple[float, float, float]
 _Row = tuple[float, float, float, float]
 _CAR = "Car"
-# KITTI writes these numbers for columns without a value.
-_NO_BOX_3D = "-1 -1 -1 -1000 -1000 -1000 -10"
 _BOX_KEYS = ("dimensions_hwl_m", "bottom_center_m", "rotation_y_rad")
 
 
@@ -191,7 +189,7 @@ def _lines(path: Path, rig_path: Path, entries: Sequence[FolderObject], with_sco
 def _columns(rig_path: Path, entry: FolderObject) -> str:
     """Observation angle, 2D box and 3D box as columns of a KITTI line."""
     if entry.dimensions_hwl_m is None or entry.bottom_center_m is None or entry.rotation_y_rad is None:
-        return f"-10 {_words(entry.box_2d or (0.0, 0.0, 0.0, 0.0))} {_NO_BOX_3D}"
+        return f"-10 {_words(entry.box_2d or (0.0, 0.0, 0.0, 0.0))} {NO_BOX_3D}"
     hwl, (x, y, z), yaw = entry.dimensions_hwl_m, entry.bottom_center_m, entry.rotation_y_rad
     alpha = math.remainder(yaw - math.atan2(x, z), 2 * math.pi)
     box_2d = entry.box_2d or _projected(rig_path, hwl, (x, y, z), yaw)

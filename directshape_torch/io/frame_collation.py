@@ -39,7 +39,7 @@ def collate(loaded: Sequence[LoadedFrame]) -> tuple[FrameBatch, Detections]:
     shapes = [frame.images_left.shape for frame in frames]
     size_hw = max(shape[-2] for shape in shapes), max(shape[-1] for shape in shapes)
     batch = FrameBatch.joined(_alike(frames, size_hw))
-    optional = ("pose_sigma", "offset_sigma_px", "track_id")
+    optional = ("pose_sigma", "offset_sigma_px", "track_id", "is_from_masks")
     known = {name for name in optional if any(getattr(part, name) is not None for part in cars)}
     sequences = list(dict.fromkeys(item.sequence for item in loaded))
     places = [sequences.index(item.sequence) for item in loaded]
@@ -100,6 +100,7 @@ def _filled(d: Detections, known: set[str], size_hw: Size) -> Detections:
         "pose_sigma": d.T_cam_obj.new_full((len(d), 4), torch.inf),
         "offset_sigma_px": torch.zeros_like(d.T_cam_obj[:, 0, 0]),
         "track_id": torch.full_like(d.frame_index, -1),
+        "is_from_masks": torch.zeros_like(d.frame_index, dtype=torch.bool),
     }
     nobody = MaskCrops.none(0, d.mask_left.size_hw, d.mask_left.values)
     hidden = d.occluders or Occluders(d.frame_index[:0], nobody, nobody, d.score[:0], d.score[:0])

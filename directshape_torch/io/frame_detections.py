@@ -52,9 +52,9 @@ def build_detections(
         dimensions_hwl=torch.tensor([o.hwl for o in refined], dtype=dtype).reshape(-1, 3),
         box_2d=torch.from_numpy(matches.box_2d[chosen]).to(dtype),
         score=torch.tensor([1.0 if o.score is None else o.score for o in refined], dtype=dtype),
-        mask_left=_crops(left, size_hw, dtype),
-        mask_right=_crops(right, size_hw, dtype),
-        occluders=_occluders(masks, [*left, *right], _depths(boxes, matches, of_box, camera), size_hw, dtype),
+        mask_left=mask_crops(left, size_hw, dtype),
+        mask_right=mask_crops(right, size_hw, dtype),
+        occluders=occluders_among(masks, [*left, *right], _depths(boxes, matches, of_box, camera), size_hw, dtype),
     )
     return FrameDetections(
         detections,
@@ -78,7 +78,7 @@ def _depths(
     }
 
 
-def _occluders(
+def occluders_among(
     masks: Sequence[InstanceMask],
     taken: Sequence[InstanceMask | None],
     depths: dict[int, float],
@@ -95,14 +95,14 @@ def _occluders(
     of_side = {side: [mask if mask.side == side else None for mask in rest] for side in SIDES}
     return Occluders(
         frame_index=torch.zeros(len(rest), dtype=torch.int64),
-        mask_left=_crops(of_side["left"], size_hw, dtype),
-        mask_right=_crops(of_side["right"], size_hw, dtype),
+        mask_left=mask_crops(of_side["left"], size_hw, dtype),
+        mask_right=mask_crops(of_side["right"], size_hw, dtype),
         depth_m=torch.tensor([depths.get(id(mask), np.nan) for mask in rest], dtype=dtype),
         bottom_v=torch.tensor([mask.mask_box[3] for mask in rest], dtype=dtype),
     )
 
 
-def _crops(masks: Sequence[InstanceMask | None], size_hw: tuple[int, int], dtype: torch.dtype) -> MaskCrops:
+def mask_crops(masks: Sequence[InstanceMask | None], size_hw: tuple[int, int], dtype: torch.dtype) -> MaskCrops:
     """Crops of the foreground probabilities, which are empty for an object without a mask."""
     empty = (0, 0, 0, 0), torch.zeros(0, 0)
     crops = [empty if mask is None else (mask.crop_box, torch.from_numpy(mask.probability)) for mask in masks]

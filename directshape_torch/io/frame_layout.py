@@ -31,7 +31,7 @@ class FrameFiles:
     left: Path
     right: Path
     calibration: Path
-    detections: Path
+    detections: Path | None  # None where boxes are made of masks
     # Possible names of the frame in a folder that a user names: "000012", or with several sequences "0005/000012" or
     # "0005_000012".
     names: tuple[str, ...]
@@ -58,14 +58,16 @@ class FrameFiles:
         return calibration if place is None else replace(calibration, Tr_velo_to_cam=read_velo_to_cam(place))
 
     def read_objects(self) -> list[KittiObject]:
-        """The lines of the detection file."""
+        """The lines of the detection file; there are none where boxes are made of masks."""
+        if self.detections is None:
+            return []
         if _is_json(self.detections):
             return folder_files.detections_of(self.detections, self.calibration)
         return objects_in(self.detections, *self.stems)
 
     def read_labels(self) -> list[KittiObject] | None:
         """The lines of the ground truth, or None."""
-        if _is_json(self.detections):
+        if self.detections is not None and _is_json(self.detections):
             return folder_files.labels_of(self.detections, self.calibration)
         if self.labels is None:
             return None
@@ -74,13 +76,13 @@ class FrameFiles:
 
     def read_plane(self, needed: bool = False) -> NDArray[np.float64] | None:
         """The ground plane (a, b, c, d), see `kitti_calibration.read_plane`, or None if absent and not needed."""
-        if _is_json(self.detections):
+        if self.detections is not None and _is_json(self.detections):
             return folder_files.plane_of(self.detections, needed)
         return read_plane(self.plane) if needed or self.plane.is_file() else None
 
     def read_motion(self) -> tuple[float | None, NDArray[np.float64] | None]:
         """Time of the frame in seconds and T_world_ref (4, 4); each is None if it is not known."""
-        if _is_json(self.detections):
+        if self.detections is not None and _is_json(self.detections):
             return folder_files.motion_of(self.detections)
         said = [
             None if path is None else of_line(path, read(path), frame_number(self.stems[0]))
@@ -99,12 +101,12 @@ class FrameFiles:
 class FrameLayout(Protocol):
     """A `FrameLayout` is a data set that is described by the files of its frames."""
 
-    detections_dir: Path  # folder of the detections
+    detections_dir: Path | None  # folder of the detections; None where boxes are made of masks
     detection_file_name: str  # for messages, such as "NNNNNN.txt"
     sequence: str  # name of the only sequence; "" for several sequences or sequences without names
 
     def frame_ids(self) -> list[str]:
-        """All frames that have detections, sorted."""
+        """All frames that have detections, or without a folder of these all frames that have an image, sorted."""
 
     def files(self, frame_id: str) -> FrameFiles:
         """The files of a frame."""

@@ -22,6 +22,8 @@ _CURE = f"write one object a line: {_COLUMNS}"
 _MOST_DIGITS = 9
 # KITTI writes this for a box without a 3D part (DontCare, 2D detectors).
 _NO_LOCATION_M = -1000.0
+NO_BOX_3D = "-1 -1 -1 -1000 -1000 -1000 -10"
+"""These are KITTI's columns of size, location and heading of an object without a 3D box."""
 
 
 @dataclass(frozen=True)

@@ -98,14 +98,16 @@ class Layout:
         sequences: folder and file names of each sequence; the name is "" for a benchmark without sequences.
         detections_dir: folder with `NNNNNN.txt` or `data/NNNNNN.txt` (one sequence), or for several
             `SEQUENCE/NNNNNN.txt`, `SEQUENCE/data/NNNNNN.txt` or `data/SEQUENCE_NNNNNN.txt`. Both may also have
-            `SEQUENCE.txt`, a result or label file of the tracking benchmark.
+            `SEQUENCE.txt`, a result or label file of the tracking benchmark. None means that boxes are made of masks.
         single: whether frame names have no prefix.
     """
 
     def __init__(
-        self, sequences: Mapping[str, tuple[Path, Patterns]], detections_dir: Path | str, *, single: bool = True
+        self, sequences: Mapping[str, tuple[Path, Patterns]], detections_dir: Path | str | None, *, single: bool = True
     ) -> None:
-        self.detections_dir = existing_folder(Path(detections_dir), "is no folder of detections")
+        self.detections_dir = (
+            None if detections_dir is None else existing_folder(Path(detections_dir), "is no folder of detections")
+        )
         self._sequences, self._single = sequences, single
         patterns = next(iter(sequences.values()))[1]
         self._ending = Path(patterns.detections).suffix
@@ -113,9 +115,15 @@ class Layout:
         self.detection_file_name = patterns.detections + ("" if "" in sequences else " or SEQUENCE.txt")
 
     def frame_ids(self) -> list[str]:
-        """The frames with a detection file, or all frames of a sequence that has one of the tracking benchmark."""
-        stems = self._detection_stems(self.detections_dir)
-        return [self._join(name, stem) for name in sorted(self._sequences) for stem in self._stems(name, stems)]
+        """The frames with a detection file, or all frames of a sequence that has one of the tracking benchmark.
+
+        Without a folder of detections they are all frames that have a left image.
+        """
+        folder = self.detections_dir
+        if folder is None:
+            return self.image_ids()
+        stems = self._detection_stems(folder)
+        return [self._join(name, stem) for name in sorted(self._sequences) for stem in self._stems(folder, name, stems)]
 
     def image_ids(self) -> list[str]:
         """The frames that have a left image."""
@@ -134,12 +142,15 @@ class Layout:
             return found(path(pattern)) if pattern else None
 
         left, right = path(patterns.left), path(patterns.right)
-        places = candidates(self.detections_dir, [*names, name] if name else names, [self._ending])
+        detections = None
+        if self.detections_dir is not None:
+            places = candidates(self.detections_dir, [*names, name] if name else names, [self._ending])
+            detections = first_existing([*places, self.detections_dir / f"{names[0]}{self._ending}"])
         return FrameFiles(
             left=find_image(left.parent, left.name),
             right=find_image(right.parent, right.name),
             calibration=first_existing([path(patterns.calibration)]),
-            detections=first_existing([*places, self.detections_dir / f"{names[0]}{self._ending}"]),
+            detections=detections,
             names=tuple(dict.fromkeys(names)),
             plane=first_existing([path(patterns.plane), path(patterns.plane, without_end)]),
             labels=known(patterns.labels),
@@ -162,15 +173,15 @@ class Layout:
             raise InputError("frame_id", "SEQUENCE_NNNNNN with a sequence of the data", repr(frame_id))
         return name, stem
 
-    def _stems(self, name: str, all_stems: list[str]) -> list[str]:
+    def _stems(self, folder: Path, name: str, all_stems: list[str]) -> list[str]:
         """The frames of a sequence that have detections; `all_stems` are names directly in the detections folder."""
-        if name and any(path.is_file() for path in candidates(self.detections_dir, [name], [self._ending])):
+        if name and any(path.is_file() for path in candidates(folder, [name], [self._ending])):
             return self._image_stems(name)
         if self._single:
             first = self._sequences[name][1].first
             return sorted({f"{stem}{first}" if "_" not in stem else stem for stem in all_stems})
         prefix = f"{name}_"
-        found = set(self._detection_stems(self.detections_dir / name))
+        found = set(self._detection_stems(folder / name))
         found |= {stem.removeprefix(prefix) for stem in all_stems if stem.startswith(prefix)}
         return sorted(found)
 
@@ -194,7 +205,7 @@ class Layout:
         return stem if self._single else f"{name}_{stem}"
 
 
-def object_layout(root: Path | str, detections_dir: Path | str) -> Layout:
+def object_layout(root: Path | str, detections_dir: Path | str | None) -> Layout:
     """KITTI's object benchmark with image_2, image_3, calib, label_2 and planes; detections are separate.
 
     The folders lie in `root/training`, else in `root/testing`, else in `root`.
@@ -213,7 +224,7 @@ def _split_with(root: Path, folder: str) -> Path | None:
     return next((base for base in (root / "training", root / "testing", root) if (base / folder).is_dir()), None)
 
 
-def odometry_layout(root: Path | str, detections_dir: Path | str) -> Layout:
+def odometry_layout(root: Path | str, detections_dir: Path | str | None) -> Layout:
     """KITTI's odometry benchmark in colour.
 
     It has `root/sequences/NN` with image_2, image_3, calib.txt and times.txt, and `root/poses/NN.txt`. `root/dataset`
@@ -234,7 +245,7 @@ def odometry_layout(root: Path | str, detections_dir: Path | str) -> Layout:
     )
 
 
-def stereo2015_layout(root: Path | str, detections_dir: Path | str) -> Layout:
+def stereo2015_layout(root: Path | str, detections_dir: Path | str | None) -> Layout:
     """KITTI Stereo 2015 (and Scene Flow 2015): two consecutive pairs of each scene, `NNNNNN_10` and `NNNNNN_11`.
 
     They are in `root/training`, `root/testing` or `root`. Detections, masks and planes of the first pair may be named
@@ -247,7 +258,7 @@ def stereo2015_layout(root: Path | str, detections_dir: Path | str) -> Layout:
     return Layout({"": (base, STEREO_2015)}, detections_dir)
 
 
-def tracking_layout(root: Path | str, detections_dir: Path | str) -> Layout:
+def tracking_layout(root: Path | str, detections_dir: Path | str | None) -> Layout:
     """A sequence of KITTI's tracking benchmark, or the whole benchmark.
 
     A sequence is `root/image_02/NNNNNN.png`, `image_03`, `calib.txt`, `label_02.txt`, `planes`. The benchmark is
@@ -267,7 +278,7 @@ def tracking_layout(root: Path | str, detections_dir: Path | str) -> Layout:
     return Layout(dict.fromkeys(names, (base, TRACKING)), detections_dir, single=False)
 
 
-def raw_layout(root: Path | str, detections_dir: Path | str) -> Layout:
+def raw_layout(root: Path | str, detections_dir: Path | str | None) -> Layout:
     """A rectified drive of KITTI's raw data, or a folder of such drives of one or several days.
 
     A drive is `root/image_02/data/NNNNNNNNNN.png` and `image_03`, with `calib_cam_to_cam.txt` in it or in the folder
@@ -295,8 +306,12 @@ def _drive(folder: Path) -> tuple[str, tuple[Path, Patterns]]:
 
 
 def folder_layout(root: Path | str, frames_dir: Path | str | None = None) -> Layout:
-    """A plain folder: `root/left`, `root/right`, `root/rig.json` and `root/frames/ID.json`, or `frames_dir/ID.json`."""
+    """A plain folder: `root/left`, `root/right`, `root/rig.json` and `root/frames/ID.json`, or `frames_dir/ID.json`.
+
+    Without a folder of frames there are no detections.
+    """
     root = Path(root)
     for name in ("left", "right"):
         existing_folder(root / name, "is no folder of images", "see docs/inputs.md, or give another --layout")
-    return Layout({"": (root, FOLDER)}, root / "frames" if frames_dir is None else frames_dir)
+    frames = root / "frames"
+    return Layout({"": (root, FOLDER)}, frames if frames_dir is None and frames.is_dir() else frames_dir)

@@ -220,16 +220,30 @@ class LayoutMasks:
     def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
         files = self.layout.files(frame_id)
         if self.directory is None:
-            return folder_files.masks_of(files.detections, files.calibration.parent, size_hw)
+            return folder_files.masks_of(_named(files.detections), files.calibration.parent, size_hw)
         source, name = _of_frame(self.directory, files.names)
         return source.read(name, size_hw)
+
+    def has_file(self, frame_id: str) -> bool:
+        """Whether the file exists without which the frame has no masks."""
+        if self.directory is None:
+            return True
+        source, name = _of_frame(self.directory, self.layout.files(frame_id).names)
+        return not isinstance(source, (FrameJsonMasks, InstancePngMasks)) or source.path(name).is_file()
 
     def files(self, frame_id: str) -> tuple[Path, ...]:
         files = self.layout.files(frame_id)
         if self.directory is None:
-            return folder_files.mask_files(files.detections, files.calibration.parent)
+            return folder_files.mask_files(_named(files.detections), files.calibration.parent)
         source, name = _of_frame(self.directory, files.names)
         return source.files(name)
+
+
+def _named(path: Path | None) -> Path:
+    """The file of a plain folder's frame, which names its masks."""
+    if path is None:
+        raise InputError("masks", "files of masks, where no detections name them", "none", "give a folder of masks")
+    return path
 
 
 def _of_frame(directory: Path, names: Sequence[str]) -> tuple[MaskSource, str]:

@@ -111,6 +111,28 @@ def _by_pixels(
     return left, right, reasons
 
 
+def right_masks(
+    left: Sequence[InstanceMask],
+    masks: Sequence[InstanceMask],
+    outlines: tuple[NDArray[np.float64], NDArray[np.float64]],
+    size_hw: tuple[int, int],
+) -> list[InstanceMask | None]:
+    """The right mask of each left mask of a car, one to one: the one that covers it best, moved by its disparity.
+
+    Args:
+        left: masks of B cars.
+        masks: masks of both images.
+        outlines: points (B, P, 2) around the boxes of these cars in both images, which say how far masks move.
+        size_hw: size of the images.
+    """
+    of_side = [mask for mask in masks if mask.side == "right" and mask.is_car]
+    shifts = _shifts_px(dict(zip(SIDES, outlines, strict=True)))
+    moved = [_moved(mask, shift, size_hw) for mask, shift in zip(left, shifts, strict=True)]
+    fits = _fits([moved], of_side, size_hw)
+    index = assign(np.where(fits >= MIN_OVERLAP, fits, 0.0))
+    return [of_side[k] if k >= 0 else None for k in index]
+
+
 def with_image_boxes(
     objects: Sequence[KittiObject], camera: StereoCamera, size_hw: tuple[int, int]
 ) -> list[KittiObject]:

@@ -35,6 +35,7 @@ from directshape_torch.io.layouts import (
 )
 from directshape_torch.io.mask_files import LayoutMasks
 from directshape_torch.io.mask_matching import with_image_boxes
+from directshape_torch.io.mask_starts import STARTED_CLASS, detections_of_masks
 from directshape_torch.io.track_association import associate
 from directshape_torch.io.velodyne import in_image, read_scan
 from directshape_torch.scene import Detections, FrameBatch
@@ -114,10 +115,12 @@ def open_dataset(
         layout: "kitti" (object benchmark), "raw", "tracking", "odometry", "stereo2015" or "folder"; or a user's own
             layout, which needs neither `root` nor `detections_dir`.
         root: folder of the data.
-        detections_dir: folder of detections; None is allowed for "folder" and means `root/frames`.
+        detections_dir: folder of detections; None means for "folder" `root/frames`, if there is one, and else that the
+            boxes are made of the masks (docs/no_boxes.md).
         masks: folder of masks (see `mask_source`), a text file of KITTI MOTS, or a `MaskSource`. None means the masks
             in the files of a "folder", and no masks in other layouts.
-        split: file with one frame in each line: its id, number or image. Default: every frame that has detections.
+        split: file with one frame in each line: its id, number or image. Default: every frame that has detections, or
+            without a folder of these every frame that has masks.
         frames: ids of the frames to use, out of the split.
         classes: object types to refine; other lines are copied.
         ground: source of ground planes. "auto" is file, else stereo, else camera height; with a disparity field stereo
@@ -135,27 +138,36 @@ def open_dataset(
 
     Raises:
         DataFormatError: a folder or the split file is missing, or the data have another layout.
-        InputError: the layout or `ground` is unknown, there are no detections or frames, or `tracks` is used in a
-            layout without sequences.
+        InputError: the layout or `ground` is unknown, there are neither detections nor masks, or no frames, boxes of
+            other classes than cars are to be made of masks, or `tracks` is used in a layout without sequences.
     """
     if isinstance(layout, str):
         if layout not in _LAYOUTS:
             raise InputError("layout", f"one of {', '.join(_LAYOUTS)}", repr(layout))
-        if detections_dir is None and layout != "folder":
-            expected = f"a folder of detections for the layout {layout!r}"
-            raise InputError("detections", expected, "none", "--detections DIR")
-        layout = _LAYOUTS[layout](root, detections_dir)
+        name, layout = layout, _LAYOUTS[layout](root, detections_dir)
+        if layout.detections_dir is None and masks is None:
+            expected = f"a folder of detections for the layout {name!r}"
+            raise InputError(
+                "detections", expected, "none", "--detections DIR, or masks alone, of which boxes are made"
+            )
     if ground not in get_args(GroundSource):
         raise InputError("ground", f"one of {', '.join(get_args(GroundSource))}", repr(ground))
     frame_ids = _chosen_frames(layout, split, frames)
     first = layout.files(frame_ids[0])
+    if layout.detections_dir is None and STARTED_CLASS not in classes:
+        raise InputError("classes", f"{STARTED_CLASS}, of which masks are", ", ".join(classes), "give detections, too")
     if tracks and layout.sequence_of(frame_ids[0]) is None:
         raise InputError("tracks", "a layout of sequences: tracking, odometry, raw or folder", "frames by themselves")
     if isinstance(masks, (str, Path)):
         is_text = Path(masks).is_file() and Path(masks).suffix.lower() == ".txt"
         masks = LayoutMasks(layout, Path(masks) if is_text else existing_folder(Path(masks), "is no folder of masks"))
-    elif masks is None and first.detections.suffix.lower() == ".json":
+    elif masks is None and first.detections is not None and first.detections.suffix.lower() == ".json":
         masks = LayoutMasks(layout, None)
+    if layout.detections_dir is None and split is None and frames is None and isinstance(masks, LayoutMasks):
+        frame_ids = tuple(filter(masks.has_file, frame_ids))
+        if not frame_ids:
+            expected = f"a left image with a file of masks in {masks.directory}"
+            raise InputError("masks", expected, "none", "give their files the names of the images")
     return StereoDataset(
         layout,
         masks,
@@ -196,6 +208,11 @@ class StereoDataset:
     def __len__(self) -> int:
         return len(self.frame_ids)
 
+    @property
+    def has_detections(self) -> bool:
+        """Whether a detector gives the boxes; else they are made of the masks."""
+        return self.layout.detections_dir is not None
+
     def load(self, frame_id: str) -> LoadedFrame:
         """Read all data of one frame.
 
@@ -219,9 +236,12 @@ class StereoDataset:
             time_s=time_s,
             T_world_cam=T_world_cam,
         )
-        objects = files.read_objects()
         masks = [] if self.masks is None else self.masks.read(frame_id, (height, width))
-        found = build_detections(objects, masks, camera, (height, width), self.classes)
+        if self.has_detections:
+            objects = files.read_objects()
+            found = build_detections(objects, masks, camera, (height, width), self.classes)
+        else:
+            found, objects = detections_of_masks(masks, frame)
         detections, rows = found.detections, found.rows
         if self.tracks:
             detections = replace(detections, track_id=self._track_id(frame_id, rows, found.tracks))
@@ -245,7 +265,7 @@ class StereoDataset:
         return read_scan(files.within(self.lidar_dir, ".bin"), calibration), to_stereo_camera(calibration)
 
     def objects(self, frame_id: str) -> list[KittiObject]:
-        """The detections of a frame, read without its images."""
+        """The detections of a frame, read without its images; there are none where boxes are made of masks."""
         return self.layout.files(frame_id).read_objects()
 
     def sequence_of(self, frame_id: str) -> str | None:
@@ -273,8 +293,8 @@ class StereoDataset:
 
     def _track_id(self, frame_id: str, rows: tuple[int, ...], mask_tracks: tuple[int, ...]) -> Tensor:
         """Track numbers (B,) of the detections, by the masks if they have tracks, else by the detection files."""
-        if any(track >= 0 for track in mask_tracks):
-            return torch.tensor(mask_tracks)
+        if any(track >= 0 for track in mask_tracks) or not self.has_detections:
+            return torch.tensor(mask_tracks, dtype=torch.int64)
         sequence = self.sequence_of(frame_id)
         if sequence not in self._tracks:
             self._tracks[sequence] = self._tracks_of(sequence)
@@ -373,9 +393,11 @@ def _chosen_frames(
 ) -> tuple[str, ...]:
     known = layout.frame_ids()
     known = known if split is None else frames_of_split(split, known, partial(_has_image, layout), layout.sequence)
-    where = f"{layout.detections_dir}" if split is None else f"{split}"
+    folder = layout.detections_dir
+    where = f"{folder or 'the left images'}" if split is None else f"{split}"
     if not known:
-        files = f"detection file {layout.detection_file_name} in" if split is None else "frame in"
+        is_file = split is None and folder is not None
+        files = f"detection file {layout.detection_file_name} in" if is_file else "frame in"
         cure = "name the folder that holds these files" if split is None else ""
         raise InputError("frames", f"at least one {files} {where}", "none", cure)
     known = known if frames is None else frames_among(known, frames, f"ids that occur in {where}")

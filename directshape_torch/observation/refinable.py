@@ -132,8 +132,12 @@ def refusals(cars: CarBatch, seen: Observation, config: RefinerConfig) -> Tensor
     else:
         lacking = _lacking_pixels(seen, config.sampling.min_usable_pixels)
     code = torch.full((len(cars),), -1, device=T.device)
+    lacking += [(~in_front, Status.behind_camera), (~finite, Status.non_finite)]
+    if cars.is_from_masks is not None:
+        without, has_mask = ~finite & cars.is_from_masks, seen.mask_areas[:, 0] > 0
+        lacking += [(without & has_mask, Status.no_start), (without & ~has_mask, Status.no_mask)]
     # Later statuses say more, so they replace earlier ones.
-    for condition, status in (*lacking, (~in_front, Status.behind_camera), (~finite, Status.non_finite)):
+    for condition, status in lacking:
         code = torch.where(condition, torch.full_like(code, status.code), code)
     return code
 

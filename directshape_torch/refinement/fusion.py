@@ -46,7 +46,7 @@ class DetectorComparison(CarRecord):
     Attributes:
         distance: (B,) distance of the images' box along the ground, metres.
         difference: (B, 7) the detector's box minus the images' box, with headings modulo half a turn. It is also NaN
-            for views of a track.
+            for views of a track and for boxes that no detector made.
         sigma_images: (B, 7) standard deviations of the images' box.
         gain: (B, 7, 7) `gain @ difference` is the most probable box minus the images' box. It is zero where boxes are
             not combined.
@@ -106,6 +106,12 @@ def compared(result: RefinementResult, cars: CarBatch, image_noise: ImageNoise) 
         distance_in_sigmas = (difference[:, None] @ weighed)[:, 0, 0].sqrt()
         covariance = gain @ of_detector
         covariance = 0.5 * (covariance + covariance.mT)
+    if cars.is_from_masks is not None:
+        # A box that was made of the same images says nothing besides them.
+        alone = cars.is_from_masks[:, None, None]
+        gain, covariance = gain.masked_fill(alone, 0.0), torch.where(alone, of_images, covariance)
+        difference = difference.masked_fill(alone[:, 0], torch.nan)
+        distance_in_sigmas = distance_in_sigmas.masked_fill(alone[:, 0, 0], torch.nan)
     return DetectorComparison(
         distance=torch.hypot(origin[:, 0], origin[:, 2]),
         difference=difference,

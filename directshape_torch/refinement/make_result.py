@@ -219,11 +219,16 @@ def _of_calibrated_rig(problem: CarProblem, figures: Figures) -> Figures:
 
 
 def judged(
-    minimum: CarMinimum[AnyState], initial: AnyState, found: RefinementResult, limits: AcceptanceConfig
+    minimum: CarMinimum[AnyState],
+    initial: AnyState,
+    found: RefinementResult,
+    limits: AcceptanceConfig,
+    is_from_masks: Tensor | None = None,
 ) -> tuple[CarMinimum[AnyState], RefinementResult]:
     """Set the statuses by the figures, and give refused cars their input state back.
 
-    An unknown probability does not refuse a car, but missing evidence does.
+    An unknown probability does not refuse a car, but missing evidence does. A car whose box was made of its mask (B,)
+    has no other box that could be better, so the probability that it is there decides alone.
     """
     status = minimum.status
     # If the iterations ran out where nothing is left to gain, the car has converged.
@@ -240,6 +245,8 @@ def judged(
     doubtful, risky = better < limits.min_probability_better, not_worse < limits.min_probability_not_worse
     is_there = bundled_trust_model().car_is_there(found.quality.evidence)
     reason = torch.where(is_there < _LEAST_IS_THERE, Status.no_car.code, Status.not_trusted.code)
+    if is_from_masks is not None:
+        doubtful = doubtful | (is_from_masks & (is_there < limits.min_probability_better))
     status = torch.where(is_refined(status) & (doubtful | risky), reason, status)
     state = where_rows(is_refined(status), minimum.state, initial)
     quality = replace(found.quality, probability_better=better, probability_not_worse=not_worse)

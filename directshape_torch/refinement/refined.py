@@ -46,7 +46,8 @@ class Refined(Generic[AnyState]):
         with torch.no_grad():
             minimum = minimise(problem, initial, problem.config.solver, start, repeats_steps)
             found = result_of(problem, minimum, cars, unrefined)
-            return cls(problem, cars, *judged(minimum, initial, found, problem.config.acceptance))
+            limits = problem.config.acceptance
+            return cls(problem, cars, *judged(minimum, initial, found, limits, cars.is_from_masks))
 
     def result(self, start: AnyState) -> RefinementResult:
         """The result, with the graph of the backward mode."""

@@ -100,7 +100,8 @@ _MEDIAN_TO_MEAN = 1.57  # variance of a median over the variance of a mean
 def observe_detections(frames: FrameBatch, detections: Detections) -> Tensor:  # (N, 8)
     """Make one row (`COLUMNS`, float64, CPU) for each car 5 to 70 m ahead whose near side is matched consistently.
 
-    A disparity field of the camera is not used. If a car has a left mask, only the pixels of the mask are used.
+    A disparity field of the camera is not used. If a car has a left mask, only the pixels of the mask are used. A box
+    that was made of the images' own disparities agrees with them wherever the rig is off, so it makes no row.
     """
     rows = [row for frame in range(len(frames)) for row in _rows_of_frame(frames, detections, frame)]
     return torch.stack(rows) if rows else torch.zeros(0, len(COLUMNS), dtype=torch.float64)
@@ -108,7 +109,10 @@ def observe_detections(frames: FrameBatch, detections: Detections) -> Tensor:  #
 
 def _rows_of_frame(frames: FrameBatch, detections: Detections, frame: int) -> list[Tensor]:
     depth = detections.T_cam_obj[:, 2, 3]
-    is_ahead = ((depth > _NEAREST_M) & (depth < _FARTHEST_M)).tolist()
+    is_evidence = (depth > _NEAREST_M) & (depth < _FARTHEST_M)
+    if detections.is_from_masks is not None:
+        is_evidence = is_evidence & ~detections.is_from_masks
+    is_ahead = is_evidence.tolist()
     ahead = [car for car in detections.telling_rows(frame) if is_ahead[car]]
     if not ahead:
         return []

@@ -89,7 +89,7 @@ class RigEstimate(nn.Module):
         return cls(*Rig.of_frame(frames))
 
     def update(self, frames: FrameBatch, detections: Detections) -> None:
-        """Add the evidence of the detections of further frames.
+        """Add the evidence of the detections of further frames; boxes that were made of masks are no evidence.
 
         Args:
             frames: frames of this rig. A frame that was added before does not count again.
@@ -116,6 +116,8 @@ class RigEstimate(nn.Module):
 
     def learn(self, frames: FrameBatch, result: RefinementResult) -> None:
         """Add how far refined cars lie from the detector's boxes, which shows the detector's errors.
+
+        Boxes that were made of masks are left out, because no detector made them.
 
         Args:
             frames: frames of this rig.
@@ -210,7 +212,10 @@ class RigEstimate(nn.Module):
         if detections.pose_sigma is None and len(self.rows):
             along = math.hypot(*self.detector[:3]) * torch.hypot(origin[:, 0], origin[:, 2])
             said["pose_sigma"] = origin.new_full((len(origin), 4), torch.inf)
-            said["pose_sigma"][:, 0] = torch.where(along > 0, along, torch.inf)
+            of_detector = along > 0
+            if detections.is_from_masks is not None:
+                of_detector = of_detector & ~detections.is_from_masks
+            said["pose_sigma"][:, 0] = torch.where(of_detector, along, torch.inf)
         if detections.offset_sigma_px is None and self.is_guess and self._is_own(frames.camera.disparity_field):
             sigma = frames.camera.field_sigma_px(detections.frame_index, origin)
             # A box without a finite place is refused elsewhere.

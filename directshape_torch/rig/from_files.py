@@ -54,7 +54,8 @@ def estimate_rigs(
 
     Frames with cars are taken evenly from all frames, at most 60 for each rig, until the field is known to 0.06 px in
     the middle of the cars. Files that cannot be read are skipped here; the refinement reports them later. The evidence
-    is added to the known `rigs`, and new rigs join the list. `tell` gets the name of each frame.
+    is added to the known `rigs`, and new rigs join the list. `tell` gets the name of each frame. Boxes that are made of
+    masks are no evidence, so a data set without detections adds none.
     """
     plain, rigs = replace(dataset, ground="camera_height", disparity_fields=()), [] if rigs is None else rigs
     for frame_ids in _frames_by_rig(plain):
@@ -76,7 +77,7 @@ def _take_in(
     dataset: StereoDataset, frame_ids: Sequence[str], tell: Callable[[str], object], rigs: list[RigEstimate]
 ) -> None:
     rig, num_seen = _rig_of_first(dataset, frame_ids, rigs), 0
-    if rig is None:
+    if rig is None or not dataset.has_detections:
         return
     for frame_id in evenly(frame_ids):
         with suppress(DirectShapeError, OSError):

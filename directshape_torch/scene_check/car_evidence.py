@@ -84,12 +84,16 @@ class FrameEvidence:
 def evidence_of_scene(frames: FrameBatch, detections: Detections, words: Words | None = None) -> list[FrameEvidence]:
     """The evidence of every frame, without cars that have non-finite numbers or neither 2D box nor mask.
 
+    Boxes that were made of masks fit the images by their making, so they are left out too.
+
     The wording is for tensors, unless `words` is given.
     """
     words = words or words_of_tensors(detections.convention)
     usable = (_array(detections.T_cam_obj).reshape(-1, 16), _array(detections.dimensions_hwl))
     known = np.logical_and.reduce([np.isfinite(part).all(axis=1) for part in usable])
     known &= np.isfinite(_array(detections.box_2d)).all(axis=1) | detections.has_mask_left.cpu().numpy()
+    if detections.is_from_masks is not None:
+        known &= ~detections.is_from_masks.cpu().numpy()
     sizes = frames.sizes.cpu().tolist()
     return [
         _frame_evidence(frames, detections, number, _known_rows(detections, number, known), (height, width), words)

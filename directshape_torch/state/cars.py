@@ -68,6 +68,8 @@ class CarBatch(Table):
     # standard deviations of the detector's boxes in `CAR_QUANTITIES`, metres, with which results are combined with
     # these boxes; None where results are not combined
     detector_noise: Annotated[Tensor | None, Dense("B", 7)] = None
+    # whether no detector made the input box, see `Detections`; None where detectors made all boxes
+    is_from_masks: Annotated[Tensor | None, Dense("B", kind="flags")] = None
 
     @classmethod
     def from_scene(cls, frames: FrameBatch, detections: Detections, disparity_sigma_px: float = 0.0) -> CarBatch:
@@ -101,6 +103,7 @@ class CarBatch(Table):
             track_id=detections.track_id,
             time_s=None if frames.time_s is None else frames.time_s[f],
             T_world_cam=None if frames.T_world_cam is None else frames.T_world_cam[f],
+            is_from_masks=detections.is_from_masks,
         )
 
     def __len__(self) -> int:

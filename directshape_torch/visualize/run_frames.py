@@ -81,7 +81,8 @@ class RunFrame:
         dataset = self.inputs.dataset
         if dataset is None or not self.inputs.has_detections:
             return None
-        if not self._are_unchanged({"detections": dataset.layout.files(self.frame_id).detections}):
+        path = dataset.layout.files(self.frame_id).detections
+        if path is None or not self._are_unchanged({"detections": path}):
             return None
         run, lines = self.inputs.run, dataset.objects(self.frame_id)
         cars = [one for one in lines if one.type in run.classes and one.has_box_3d]

@@ -45,3 +45,11 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(changed) == 2
     assert "--fresh" in capsys.readouterr().err
     assert main([*changed, "--fresh"]) == 0
+
+
+def test_demo_from_masks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["demo", "--from-masks", "--out", str(tmp_path), "--device", "cpu"]) == 0
+    overlap = re.search(r"mean .* (\d\.\d\d) -> +(\d\.\d\d)", capsys.readouterr().out)
+    before, after = map(float, overlap.groups())
+    assert before > 0.7
+    assert after > before + 0.05

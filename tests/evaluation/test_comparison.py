@@ -236,6 +236,28 @@ def test_command_prints_and_writes(
     assert [row["depth_m"] for row in rows] == ["25", "8", "40"]
 
 
+def test_results_without_boxes_before_are_measured_alone(folders: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    labels, _, after = folders
+    (after / "000002.txt").write_text(f"Car -1 -1 -10 {BOXES_2D['far']} -1 -1 -1 -1000 -1000 -1000 -10 0.7\n")
+    found = compare_results(labels, None, after)
+    metrics = found.overall.metrics
+    # The line without a box is the third of the counted cars.
+    assert metrics["bev_iou_mean"].after.value == pytest.approx((1 + 0.6 + 0) / 3)
+    assert metrics["yaw_axis_good_share"].after.value == pytest.approx(2 / 3)
+    assert metrics["bev_iou_mean"].before is None
+    assert metrics["bev_iou_mean"].change is None
+    assert found.overall.worse_share is None
+    assert [car.before for car in found.cars] == [None] * 3
+    table = tmp_path / "cars.csv"
+    command = ["compare", "--labels", str(labels), "--after", str(after), "--csv", str(table)]
+    assert main([*command, "--json", str(tmp_path / "all.json")]) == 0
+    with table.open() as file:
+        assert [row["bev_iou_before"] for row in csv.DictReader(file)] == [""] * 3
+    content = json.loads((tmp_path / "all.json").read_text())
+    assert content["overall"]["metrics"]["centre_m_median"]["before"] is None
+    assert "->" not in format_comparison(found)
+
+
 @pytest.mark.skipif("DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA is not set: rendered frames needed")
 @pytest.mark.parametrize(("detector", "bev_iou"), [("stereo", 0.722), ("mono", 0.487), ("gt", 1.0)])
 def test_simulated_detectors(detector: str, bev_iou: float):

@@ -252,6 +252,16 @@ def samples() -> Tensor:
     return grids().values(torch.eye(4, 3, dtype=torch.float32))
 
 
+def started(n: Numbers) -> Detections:
+    """The start of a car whose back is 12 m ahead, on a hill, because these images lie above the horizon."""
+    given = frames(n)
+    disparity = torch.full_like(given.images_left[:, 0], 0.5327 * float(given.camera.K_left[0, 0, 0]) / 12.0)
+    ground = GroundPlane(given.ground.normal, torch.full_like(given.ground.offset, -1.25), given.ground.source)
+    mask = torch.zeros(1, *given.images_left.shape[2:], dtype=torch.bool)
+    mask[0, 5:95, 20:118] = True
+    return Detections.from_masks(replace(given, disparity=disparity, ground=ground), mask, score=n.depth[:1])
+
+
 Case = Callable[[Numbers], Any]
 # What a `Numbers` gives that is compared: tensors, arrays, or records and tuples of them.
 CASES: dict[str, Case] = {
@@ -304,6 +314,7 @@ CASES: dict[str, Case] = {
     "StereoCamera.field_sigma_px": lambda n: camera(n).field_sigma_px(torch.zeros(20, dtype=torch.long), n.points),
     "FrameBatch.from_images": lambda n: tensors(frames(n)),
     "Detections.from_boxes": lambda n: tensors(detections(n)),
+    "Detections.from_masks": lambda n: tensors(started(n)),
     **of_prior("PCAShapePrior", "GridShape", grids),
     **of_prior("NeuralShapePrior", "NeuralShape", network),
     "CodedLinear.shift": lambda n: network().coded_layers()[0].shift(n.code),

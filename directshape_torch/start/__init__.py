@@ -1,0 +1,1 @@
+"""This package makes start boxes of cars from instance masks and stereo disparity, without a detector."""

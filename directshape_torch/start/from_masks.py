@@ -1,0 +1,142 @@
+"""This module makes detections of instance masks and stereo disparity, where no detector gives boxes."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from directshape_torch.errors import InputError
+from directshape_torch.geometry.box3d import pose_from_kitti, wrap_angle
+from directshape_torch.masks import MaskCrops
+from directshape_torch.numerics.full_precision import in_full_precision
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.start.mask_points import MaskPoints, points_under
+from directshape_torch.start.rectangle_fit import MEAN_HWL, InstancePoints, fit_rectangles
+from directshape_torch.stereo_matching.disparity import with_disparity
+
+# A mask with fewer known disparities, or with a smaller share of them, shows no car.
+_FEWEST_POINTS, _LEAST_KNOWN_SHARE = 30, 0.1
+# Points farther than this from the middle of an instance's points are of something before it or behind it.
+_REACH_M = 4.5
+# Bumpers and doors are near the rectangle of a car; wheels, bonnet and windows count for less.
+_BAND_M, _OFF_BAND_WEIGHT = (0.25, 1.0), 0.1
+# The mask is cut off where it comes this near to the border of the image.
+_BORDER_PX = 2
+# Height and width in the image, and distance, that the mask of a car can have.
+_HEIGHT_M, _WIDTH_M, _DEPTH_M = (0.4, 2.4), (0.5, 6.5), (2.0, 80.0)
+# Median height of a car's points above the road, which may be known badly, and median deviation from it.
+_MIDDLE_M, _SPREAD_M = (-0.5, 2.0), (0.08, 1.0)
+# The fit of a car has at most this robust cost, square metres.
+_LARGEST_COST = 0.12
+# This many instances are fitted at once, which limits the memory.
+_PORTION = 64
+
+
+@torch.no_grad()
+@in_full_precision
+def start_boxes(
+    frames: FrameBatch,
+    mask_left: MaskCrops,  # M masks
+    mask_right: MaskCrops,  # M masks
+    frame_index: Tensor,  # (M,)
+    score: Tensor,  # (M,)
+) -> Detections:
+    """The detections of `Detections.from_masks`."""
+    _check_frame_index(frame_index, len(frames))
+    seen = _near_each_other(points_under(with_disparity(frames, needed=frame_index), mask_left, frame_index))
+    above = _height_above_ground(seen.points_cam, frames, frame_index)
+    place, cost = _placed(frames, mask_left, frame_index, seen, above)
+    is_car = _looks_like_a_car(frames, mask_left, frame_index, seen, above, place, cost)
+    x, z, heading, length, width = place.unbind(-1)
+    normal, offset = (each[frame_index] for each in (frames.ground.normal, frames.ground.offset))
+    y = -(normal[:, 0] * x + normal[:, 2] * z + offset) / normal[:, 1]
+    T_cam_obj = pose_from_kitti(torch.stack([x, y, z], dim=-1), _facing(x, z, heading))
+    hwl = torch.stack([torch.full_like(length, MEAN_HWL[0]), width, length], dim=-1)
+    return Detections(
+        frame_index=frame_index,
+        T_cam_obj=torch.where(is_car[:, None, None], T_cam_obj, torch.nan),
+        dimensions_hwl=torch.where(is_car[:, None], hwl, torch.nan),
+        box_2d=mask_left.box_2d.to(place),
+        score=score,
+        mask_left=mask_left,
+        mask_right=mask_right,
+        is_from_masks=torch.ones_like(is_car),
+    )
+
+
+def _check_frame_index(frame_index: Tensor, num_frames: int) -> None:
+    if len(frame_index) and not 0 <= int(frame_index.min()) <= int(frame_index.max()) < num_frames:
+        raise InputError("frame_index", f"0..{num_frames - 1}", f"{frame_index.min()}..{frame_index.max()}")
+
+
+def _near_each_other(seen: MaskPoints) -> MaskPoints:
+    """The points without those far before or behind the others of their instance."""
+    depth = seen.points_cam[..., 2:]
+    is_near = (depth - depth.nanmedian(dim=1, keepdim=True).values).abs() < _REACH_M
+    return seen._replace(points_cam=torch.where(is_near, seen.points_cam, torch.nan))
+
+
+def _height_above_ground(points_cam: Tensor, frames: FrameBatch, frame_index: Tensor) -> Tensor:
+    """Heights (M, P) of points above the road, metres."""
+    normal, offset = (each[frame_index] for each in (frames.ground.normal, frames.ground.offset))
+    return (points_cam * normal[:, None]).sum(-1) + offset[:, None]
+
+
+def _placed(
+    frames: FrameBatch, masks: MaskCrops, frame_index: Tensor, seen: MaskPoints, above: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The rectangle (M, 5) of lowest cost of each instance, and this cost (M,)."""
+    xz = seen.points_cam[..., 0::2]
+    on_band = (above > _BAND_M[0]) & (above < _BAND_M[1])
+    weight = torch.where(on_band, torch.ones_like(above), _OFF_BAND_WEIGHT) * above.isfinite()
+    K, width = frames.camera.K_left[frame_index], frames.sizes[frame_index, 1:]
+    columns = masks.extents[:, 0::2]
+    of_instances = InstancePoints(
+        xz=xz.nan_to_num(),
+        weight=weight / weight.sum(dim=1, keepdim=True),
+        middle=xz.nanmedian(dim=1).values,
+        # The border of a column of pixels lies half a pixel beside its centre.
+        outline=(columns - 0.5 - K[:, 0, 2:]) / K[:, 0, :1],
+        is_outline_known=torch.cat([columns[:, :1] > _BORDER_PX, columns[:, 1:] < width - _BORDER_PX], dim=1),
+    )
+    best, costs = [of_instances.xz.new_zeros(0, 5)], [xz.new_zeros(0)]
+    for first in range(0, len(xz), _PORTION):
+        fitted = fit_rectangles(InstancePoints(*(each[first : first + _PORTION] for each in of_instances)))
+        cost, chosen = fitted.cost.nan_to_num(nan=math.inf).min(dim=1)
+        best.append(fitted.place.gather(1, chosen[:, None, None].expand(-1, 1, 5))[:, 0])
+        costs.append(cost)
+    return torch.cat(best), torch.cat(costs)
+
+
+def _looks_like_a_car(
+    frames: FrameBatch,
+    masks: MaskCrops,
+    frame_index: Tensor,
+    seen: MaskPoints,
+    above: Tensor,
+    place: Tensor,
+    cost: Tensor,
+) -> Tensor:
+    """Whether (M,) there is enough evidence, and the evidence is that of something of a car's size on the road."""
+    depth, focal = place[:, 1], frames.camera.K_left[frame_index, 0, 0]
+    u0, v0, u1, v1 = masks.extents.to(depth).unbind(-1)
+    enough = (seen.num_known >= _FEWEST_POINTS) & (seen.known_share >= _LEAST_KNOWN_SHARE)
+    middle = above.nanmedian(dim=1, keepdim=True).values
+    ranges = (
+        ((v1 - v0) * depth / focal, _HEIGHT_M),
+        ((u1 - u0) * depth / focal, _WIDTH_M),
+        (depth, _DEPTH_M),
+        (middle[:, 0], _MIDDLE_M),
+        ((above - middle).abs().nanmedian(dim=1).values, _SPREAD_M),
+        (cost, (0.0, _LARGEST_COST)),
+    )
+    fits = [(value >= low) & (value <= high) for value, (low, high) in ranges]  # NaN is in no range
+    return torch.stack([enough, *fits]).all(dim=0)
+
+
+def _facing(x: Tensor, z: Tensor, heading: Tensor) -> Tensor:
+    """The heading or its opposite, whichever points away from the camera: more cars are seen from behind."""
+    away = torch.cos(heading) * x - torch.sin(heading) * z
+    return wrap_angle(torch.where(away < 0, heading + math.pi, heading))

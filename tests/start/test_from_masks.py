@@ -1,0 +1,145 @@
+"""Masks and disparity alone give boxes near the truth, and say where they give none."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+import directshape_torch
+from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, InputError, MaskCrops, Status
+from directshape_torch.geometry.box3d import rotation_y_from_pose
+from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.io.frame_collation import collate
+from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
+from directshape_torch.stereo_matching.disparity import with_disparity
+
+DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
+
+
+@lru_cache(maxsize=1)
+def demo() -> LoadedFrame:
+    """The six cars with their true boxes, and frames that have been matched."""
+    loaded = open_dataset("kitti", DEMO, DEMO / "training" / "label_2", DEMO / "training" / "masks").load("000000")
+    return replace(loaded, frame=with_disparity(loaded.frame))
+
+
+def started(masks: MaskCrops | Tensor | None = None, frames: FrameBatch | None = None) -> Detections:
+    loaded = demo()
+    return Detections.from_masks(frames or loaded.frame, loaded.detections.mask_left if masks is None else masks)
+
+
+def axis_error_deg(detections: Detections, truth: Detections) -> Tensor:
+    turned = rotation_y_from_pose(detections.T_cam_obj) - rotation_y_from_pose(truth.T_cam_obj)
+    return (turned / math.pi * 180 + 90).remainder(180).sub(90).abs()
+
+
+def test_boxes_of_the_demo_are_near_the_truth() -> None:
+    found, truth = started(), demo().detections
+    assert found.is_from_masks is not None
+    assert found.is_from_masks.all()
+    off = found.T_cam_obj[:, :3, 3] - truth.T_cam_obj[:, :3, 3]
+    distance = truth.T_cam_obj[:, :3, 3].norm(dim=1)
+    assert (off.norm(dim=1) < 0.4 + 0.03 * distance).all()
+    assert (axis_error_deg(found, truth) < 20).all()
+    assert (found.dimensions_hwl - truth.dimensions_hwl).abs().amax() < 0.8
+    assert found.box_2d.equal(truth.mask_left.box_2d.to(found.box_2d))
+
+
+def test_a_car_turned_away_is_seen_from_behind() -> None:
+    found = started()
+    forward, origin = found.T_cam_obj[:, :3, 0], found.T_cam_obj[:, :3, 3]
+    assert ((forward * origin)[:, 0::2].sum(dim=1) > 0).all()
+
+
+def test_the_result_does_not_depend_on_the_other_masks() -> None:
+    crops = demo().detections.mask_left
+    whole, alone = started(crops), started(crops.rows(torch.tensor([3])))
+    torch.testing.assert_close(alone.T_cam_obj[0], whole.T_cam_obj[3], rtol=0, atol=1e-4)
+
+
+def test_frames_are_matched_where_they_have_no_disparity() -> None:
+    found = started(frames=replace(demo().frame, disparity=None))
+    assert found.T_cam_obj.equal(started().T_cam_obj)
+
+
+def test_a_disparity_field_moves_the_boxes() -> None:
+    frames = demo().frame
+    camera = frames.camera
+    matrices = (camera.K_left[0], camera.K_right[0], camera.T_right_cam[0])
+    height, width = frames.images_left.shape[2:]
+    field = DisparityField.constant(-0.5, (width, height), *matrices)
+    shifted = replace(frames, camera=replace(camera, disparity_field=field), disparity=frames.disparity - 0.5)
+    torch.testing.assert_close(started(frames=shifted).T_cam_obj, started().T_cam_obj, rtol=0, atol=0.02)
+    plain = replace(frames, disparity=frames.disparity - 0.5)
+    assert (started(frames=plain).T_cam_obj[:, 2, 3] > started().T_cam_obj[:, 2, 3] + 0.03).all()
+
+
+@pytest.mark.parametrize("what", ["sky", "road", "tiny", "no disparity", "whole image", "nothing"])
+def test_what_shows_no_car_gets_no_box(what: str) -> None:
+    frames = demo().frame
+    mask = torch.zeros(1, *frames.images_left.shape[2:], dtype=torch.bool)
+    place = {
+        "sky": (slice(0, 60), slice(300, 420)),
+        "road": (slice(300, 370), slice(500, 900)),
+        "tiny": (slice(200, 204), slice(600, 605)),
+        "no disparity": (slice(185, 261), slice(552, 648)),
+        "whole image": (slice(None), slice(None)),
+        "nothing": (slice(0), slice(0)),
+    }[what]
+    mask[0][place] = True
+    if what == "no disparity":
+        frames = replace(frames, disparity=torch.full_like(frames.images_left[:, 0], torch.nan))
+    found = started(mask, frames)
+    assert found.T_cam_obj.isnan().all()
+    with torch.no_grad():
+        result = DirectShapeRefiner()(frames, found)
+    assert result.status == [Status.no_mask if what == "nothing" else Status.no_start]
+
+
+def test_masks_without_a_box_leave_the_others_alone() -> None:
+    crops, frames = demo().detections.mask_left, demo().frame
+    sky = torch.zeros(frames.images_left.shape[2:])
+    sky[:60, 300:420] = 1
+    found = Detections.from_masks(frames, [crops[0], sky, None, crops[1]], score=[0.9, 0.8, 0.7, 0.6])
+    known = found.T_cam_obj.isfinite().flatten(1).all(dim=1)
+    assert known.tolist() == [True, False, False, True]
+    torch.testing.assert_close(found.T_cam_obj[[0, 3]], started().T_cam_obj[:2], rtol=0, atol=1e-4)
+    torch.testing.assert_close(found.score, torch.tensor([0.9, 0.8, 0.7, 0.6]))
+
+
+def test_no_masks_give_no_boxes() -> None:
+    frames = demo().frame
+    assert len(Detections.from_masks(frames, torch.zeros(0, *frames.images_left.shape[2:]))) == 0
+
+
+def test_wrong_masks_and_frames_are_named() -> None:
+    frames, crops = demo().frame, demo().detections.mask_left
+    with pytest.raises(InputError, match=r"mask_left: expected masks of the \(padded\) image size"):
+        Detections.from_masks(frames, torch.zeros(1, 20, 30))
+    with pytest.raises(InputError, match=r"mask_right: expected 6 masks"):
+        Detections.from_masks(frames, crops, crops.rows(torch.tensor([0])))
+    with pytest.raises(InputError, match=r"frame_index: expected 0\.\.0, got 0\.\.1"):
+        Detections.from_masks(frames, crops, frame_index=[0, 0, 0, 0, 0, 1])
+    with pytest.raises(InputError, match=r"frame_index: expected shape \(6,\)"):
+        Detections.from_masks(frames, crops, frame_index=[0, 0])
+
+
+@pytest.mark.skipif("DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA is not set: rendered frames needed")
+def test_rendered_cars_have_the_right_axis_and_place() -> None:
+    root = Path(os.environ["DIRECTSHAPE_DATA"]) / "rendered"
+    masks = root / "training" / "masks"
+    dataset = open_dataset("kitti", root, root / "detections" / "gt", masks, frames=[0, 3, 6, 9, 12])
+    frames, truth = collate([dataset.load(frame_id) for frame_id in dataset.frame_ids])
+    truth = truth.rows(truth.has_mask_left.nonzero()[:, 0])
+    found = Detections.from_masks(frames, truth.mask_left, frame_index=truth.frame_index)
+    assert found.T_cam_obj.isfinite().flatten(1).all(dim=1).float().mean() > 0.9
+    off = found.T_cam_obj[:, 0:3:2, 3] - truth.T_cam_obj[:, 0:3:2, 3]
+    assert off.norm(dim=1).nanmedian() < 0.3
+    assert (axis_error_deg(found, truth) < 20).float().mean() > 0.85
