@@ -354,7 +354,8 @@ class Detections(TensorRecord):
         `no_start`.
 
         The boxes are made of the same disparities that a rig would be checked with, so they are no evidence of it
-        (`is_from_masks`): frames need a camera whose disparity is right, or a known `disparity_field`.
+        (`is_from_masks`): frames need a camera whose disparity is right, or a known `disparity_field`, such as
+        `RigEstimate.corrected` gives them.
 
         Args:
             frames: F frames; frames with a disparity of their own are not matched.
@@ -369,8 +370,13 @@ class Detections(TensorRecord):
         from directshape_torch.start.from_masks import start_boxes
 
         like = frames.images_left
-        left = MaskCrops.of(mask_left, name="mask_left").to(like.device)
-        count, size_hw = len(left), (like.shape[2], like.shape[3])
+        size_hw = like.shape[2], like.shape[3]
+        # A list without any mask, as of an empty street, does not tell the size of the images.
+        is_nothing = isinstance(mask_left, (list, tuple)) and all(mask is None for mask in mask_left)
+        left = (
+            MaskCrops.none(len(mask_left), size_hw, like) if is_nothing else MaskCrops.of(mask_left, name="mask_left")
+        )
+        left, count = left.to(like.device), len(left)
         right = (
             MaskCrops.none(count, left.size_hw, left.values)
             if mask_right is None

@@ -60,8 +60,11 @@ def run(args: argparse.Namespace) -> int:
     rigs = [] if args.rig == "none" else load_rigs(args.rig)
     for source in dict.fromkeys(args.sources):
         if source == "detections":
+            dataset = dataset_of(args)
+            if not dataset.has_detections:
+                raise InputError("--detections", "boxes of a detector", "none", "boxes made of masks show no rig")
             with Bar(desc=source, unit="frame", disable=None) as bar:
-                estimate_rigs(dataset_of(args), lambda _: bar.update(), rigs)
+                estimate_rigs(dataset, lambda _: bar.update(), rigs)
         elif source == "motion":
             _add_motion(args, rigs)
         else:

@@ -20,6 +20,7 @@ from directshape_torch.evaluation.matching import (
     objects_of_frame,
 )
 from directshape_torch.evaluation.pose_error import CarErrors, errors_of
+from directshape_torch.io.frame_layout import existing_folder
 from directshape_torch.io.kitti_labels import KittiObject, objects_in, objects_path
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.refinement.trust import WORSE_BY
@@ -180,6 +181,7 @@ def _frames_of(before: Path, after: Path) -> tuple[str, ...]:
     results = files_of_frames(after)
     if before.is_file():
         return tuple(results)
+    existing_folder(before, "is no folder of result files")
     of_sequence: dict[str, list[str]] = {}
     for stem in results:
         of_sequence.setdefault(stem.rpartition("_")[0], []).append(stem)

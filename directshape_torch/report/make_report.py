@@ -91,7 +91,9 @@ def _notes(inputs: RunInputs, num_detailed: int) -> list[str]:
     run, dataset, notes = inputs.run, inputs.dataset, _unfinished(inputs.run.path)
     if dataset is None:
         notes.append("no pictures and no residual maps: the images were not given (--data)")
-    if dataset is None or not inputs.has_detections:
+    if run.manifest.config.get("boxes") == "masks":
+        notes.append("nothing from before the refinement: the boxes were made of masks")
+    elif dataset is None or not inputs.has_detections:
         notes.append("nothing from before the refinement: the detections were not given (--detections)")
     if dataset is not None and dataset.masks is None:
         notes.append("no residual maps: the masks were not given (--masks)")

@@ -106,7 +106,7 @@ def overlay_picture(
 ) -> Picture:
     """Two rows with the image, before and after; below them each car enlarged; at the right the view from above."""
     rows = [
-        _image_row(view, before, f"{title}  before: the detector's box, mean shape"),
+        _image_row(view, before, f"{title}  before: the start box, mean shape"),
         _image_row(view, after, f"{title}  after: refined box and shape"),
     ]
     left = beside([*rows, *_tile_rows(view, before, after, rows[0].shape[1])], below=True)

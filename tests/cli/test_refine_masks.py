@@ -112,3 +112,18 @@ def test_masks_without_cars_are_named(tmp_path: Path, capsys: pytest.CaptureFixt
 def test_only_masks_of_cars_become_boxes(masks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["refine", *inputs(masks), "--classes", "Van", "--out", str(tmp_path), *QUICK]) == 2
     assert "classes: expected Car" in capsys.readouterr().err
+
+
+def test_masks_show_no_rig(masks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibrate-rig", *inputs(masks), "--out", str(tmp_path / "rig.json")]) == 2
+    assert (
+        "--detections: expected boxes of a detector, got none; boxes made of masks show no rig"
+        in capsys.readouterr().err
+    )
+    assert not (tmp_path / "rig.json").exists()
+
+
+def test_a_run_that_is_not_there_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    labels = DEMO / "training" / "label_2"
+    assert main(["compare", "--labels", str(labels), "--after", str(tmp_path / "nowhere")]) == 2
+    assert "nowhere: is no folder of result files" in capsys.readouterr().err

@@ -114,6 +114,11 @@ def test_masks_without_a_box_leave_the_others_alone() -> None:
     torch.testing.assert_close(found.score, torch.tensor([0.9, 0.8, 0.7, 0.6]))
 
 
+def test_a_list_without_masks_is_an_empty_street() -> None:
+    assert len(Detections.from_masks(demo().frame, [])) == 0
+    assert Detections.from_masks(demo().frame, [None, None]).T_cam_obj.isnan().all()
+
+
 def test_no_masks_give_no_boxes() -> None:
     frames = demo().frame
     assert len(Detections.from_masks(frames, torch.zeros(0, *frames.images_left.shape[2:]))) == 0
