@@ -123,8 +123,8 @@ def test_time_belongs_to_the_innermost_function_that_has_a_part(monkeypatch: pyt
     monkeypatch.setattr(stage_profile, "PARTS", {"inner": (inner,), "outer": (outer,)})
     # The helper's two seconds are its caller's; the time after the call counts as that before it.
     assert profile_parts(outer, clock) == {"inner": 3, "outer": 12, "everything else": 0}
-    monkeypatch.setattr(stage_profile, "PARTS", {"inner": (inner,), stage_profile._OUTCOME: (outer,)})
-    assert profile_parts(outer, clock)[stage_profile._OUTCOME] == 15
+    monkeypatch.setattr(stage_profile, "PARTS", {"inner": (inner,), stage_profile._RESULT: (outer,)})
+    assert profile_parts(outer, clock)[stage_profile._RESULT] == 15
 
 
 def test_no_part_of_a_refinement_is_empty_and_they_add_up() -> None:
