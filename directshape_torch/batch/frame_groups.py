@@ -16,7 +16,7 @@ class FrameGroup:
     wanted: frozenset[str]
 
     def without(self, finished: Collection[str]) -> FrameGroup:
-        """The same group with fewer frames to write."""
+        """The group without the finished frames among those that are to be written."""
         return replace(self, wanted=self.wanted.difference(finished))
 
     def halves(self) -> tuple[FrameGroup, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -36,17 +37,8 @@ def detections_of_masks(
     found = Detections.from_masks(frame, mask_crops(left, size_hw, dtype), score=score)
     outlines = box_outlines(found.T_cam_obj, found.dimensions_hwl, frame.camera)
     right = right_masks(left, masks, outlines, size_hw)
-    detections = Detections(
-        found.frame_index,
-        found.T_cam_obj,
-        found.dimensions_hwl,
-        found.box_2d,
-        found.score,
-        found.mask_left,
-        mask_crops(right, size_hw, dtype),
-        occluders_among(masks, [*left, *right], {}, size_hw, dtype),
-        is_from_masks=found.is_from_masks,
-    )
+    occluders = occluders_among(masks, [*left, *right], {}, size_hw, dtype)
+    detections = replace(found, mask_right=mask_crops(right, size_hw, dtype), occluders=occluders)
     tracks = tuple(mask.track_id for mask in left)
     objects = _lines(detections, frame.camera.t_cam_ref[0])
     return FrameDetections(detections, tuple(range(len(left))), tracks, ("",) * len(left)), objects

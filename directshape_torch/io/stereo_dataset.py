@@ -158,19 +158,12 @@ def open_dataset(
         raise InputError("classes", f"{STARTED_CLASS}, of which masks are", ", ".join(classes), "give detections, too")
     if tracks and layout.sequence_of(frame_ids[0]) is None:
         raise InputError("tracks", "a layout of sequences: tracking, odometry, raw or folder", "frames by themselves")
-    if isinstance(masks, (str, Path)):
-        is_text = Path(masks).is_file() and Path(masks).suffix.lower() == ".txt"
-        masks = LayoutMasks(layout, Path(masks) if is_text else existing_folder(Path(masks), "is no folder of masks"))
-    elif masks is None and first.detections is not None and first.detections.suffix.lower() == ".json":
-        masks = LayoutMasks(layout, None)
-    if layout.detections_dir is None and split is None and frames is None and isinstance(masks, LayoutMasks):
-        frame_ids = tuple(filter(masks.has_file, frame_ids))
-        if not frame_ids:
-            expected = f"a left image with a file of masks in {masks.directory}"
-            raise InputError("masks", expected, "none", "give their files the names of the images")
+    source = _mask_source(layout, masks, first)
+    if layout.detections_dir is None and split is None and frames is None and isinstance(source, LayoutMasks):
+        frame_ids = _frames_with_masks(source, frame_ids)
     return StereoDataset(
         layout,
-        masks,
+        source,
         frame_ids,
         frozenset(classes),
         ground,
@@ -181,6 +174,25 @@ def open_dataset(
         tracks,
         dtype,
     )
+
+
+def _mask_source(layout: FrameLayout, masks: Path | str | MaskSource | None, first: FrameFiles) -> MaskSource | None:
+    """The masks that `open_dataset` was given, else the masks in the files of a plain folder."""
+    if isinstance(masks, (str, Path)):
+        is_text = Path(masks).is_file() and Path(masks).suffix.lower() == ".txt"
+        return LayoutMasks(layout, Path(masks) if is_text else existing_folder(Path(masks), "is no folder of masks"))
+    if masks is None and first.detections is not None and first.detections.suffix.lower() == ".json":
+        return LayoutMasks(layout, None)
+    return masks
+
+
+def _frames_with_masks(masks: LayoutMasks, frame_ids: tuple[str, ...]) -> tuple[str, ...]:
+    """The frames that have a file of masks; raises `InputError` if no frame has one."""
+    found = tuple(filter(masks.has_file, frame_ids))
+    if not found:
+        expected = f"a left image with a file of masks in {masks.directory}"
+        raise InputError("masks", expected, "none", "give their files the names of the images")
+    return found
 
 
 def _folder(path: Path | str | None, what: str) -> Path | None:

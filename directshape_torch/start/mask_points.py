@@ -7,12 +7,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.geometry.projection import rays_from_pixels
-from directshape_torch.geometry.stereo_depth import depth_from_disparity
+from directshape_torch.geometry.stereo_depth import points_from_disparity
 from directshape_torch.masks import MASK_THRESHOLD, MaskCrops
 from directshape_torch.scene import FrameBatch
 
-# So many pixels of a mask are looked at, and so many of those with a disparity become points.
+# At most 1600 pixels of a mask are examined, and at most 100 of those with a disparity become points.
 _MOST_PIXELS, _MOST_POINTS = 1600, 200
 # Disparities below this are of objects beyond every car, or wrong.
 _LEAST_DISPARITY_PX = 2.0
@@ -22,7 +21,7 @@ class MaskPoints(NamedTuple):
     """`MaskPoints` are the points of M instances, at most P of each; places without a point are NaN."""
 
     points_cam: Tensor  # (M, P, 3) metres
-    known_share: Tensor  # (M,) share of the looked at pixels inside the mask's border whose disparity is known
+    known_share: Tensor  # (M,) share of the examined pixels inside the mask's border whose disparity is known
     num_known: Tensor  # (M,) number of these pixels
 
 
@@ -49,9 +48,8 @@ def points_under(
     camera, f = frames.camera, frame_index[:, None]
     uv, K_left = uvd[..., :2].nan_to_num(), camera.K_left[f]
     of_right = camera.K_right[f], camera.T_right_cam[f]
-    depth = depth_from_disparity(uv, uvd[..., 2], K_left, *of_right, camera.disparity_field)
-    points = depth[..., None] * rays_from_pixels(uv, K_left)
-    return MaskPoints(points, num_known.to(depth) / num_inner.clamp_min(1), num_known)
+    points = points_from_disparity(uv, uvd[..., 2], K_left, *of_right, camera.disparity_field)
+    return MaskPoints(points, num_known.to(points) / num_inner.clamp_min(1), num_known)
 
 
 def _inner_pixels(masks: MaskCrops) -> tuple[Tensor, Tensor, Tensor]:

@@ -180,7 +180,7 @@ class TouchedElements(TorchDispatchMode):
 
 
 def enlarged(frames: FrameBatch, d: Detections, factor: int) -> tuple[FrameBatch, Detections]:
-    """The same cars in a frame that is larger below and to the right of them."""
+    """Cars in a frame that was enlarged at its bottom and at its right side."""
     height, width = frames.images_left.shape[2:]
     more = (0, (factor - 1) * width, 0, (factor - 1) * height)
     images = {

@@ -1,4 +1,4 @@
-"""The same car in several frames gets one shape and many poses, and cars without tracks are unchanged."""
+"""These tests show that all views of a tracked car get one shape, and that cars without tracks stay unchanged."""
 
 from __future__ import annotations
 
