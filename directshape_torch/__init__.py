@@ -15,14 +15,15 @@ from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.ground_plane import GroundPlane
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.config_files import load_config
-from directshape_torch.masks import MaskCrops
 from directshape_torch.refinement.disparity_profile import DisparityProfile
 from directshape_torch.refinement.observability import Observability
 from directshape_torch.refinement.quality import FitQuality
 from directshape_torch.refinement.result import KittiBoxes, RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.estimate import RigEstimate
-from directshape_torch.scene import Detections, FrameBatch, Occluders
+from directshape_torch.scene.detections import Detections, Occluders
+from directshape_torch.scene.frames import FrameBatch
+from directshape_torch.scene.masks import MaskCrops
 from directshape_torch.scene_check.check_scene import check_scene
 from directshape_torch.scene_check.finding import CheckReport, Finding
 from directshape_torch.shape.pca_prior import PCAShapePrior

@@ -12,9 +12,8 @@ from pathlib import Path
 from torch import Tensor
 
 import directshape_torch
-from directshape_torch import DirectShapeRefiner, RefinementResult
+from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, RefinementResult
 from directshape_torch.io.stereo_dataset import open_dataset
-from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.state.cars import CarBatch
 from directshape_torch.state.unknowns import State

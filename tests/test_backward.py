@@ -14,7 +14,8 @@ from torch import Tensor
 from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.geometry import se3
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.solver.differentiate import StartNotReachedWarning
 
 

@@ -20,7 +20,8 @@ from directshape_torch.errors import InputError, NoGradientWarning
 from directshape_torch.refinement import refined as refinements
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.solver.differentiate import NotStationaryWarning
 
 MODES = ("unroll", "implicit", "implicit_gauss_newton")

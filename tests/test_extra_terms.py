@@ -21,7 +21,7 @@ from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rows import Blocks
-from directshape_torch.scene import Detections
+from directshape_torch.scene.detections import Detections
 from directshape_torch.shape.field import Field
 from directshape_torch.state.cars import CarBatch, CarState
 from directshape_torch.state.unknowns import CODE, OFFSET, POSE

@@ -15,7 +15,8 @@ from torch import Tensor
 from directshape_torch.config import PointCloudConfig, RefinerConfig, StageConfig
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.status import Status
 
 WEAK = replace(DEFAULT.priors, shape_weight=0.01, dimensions_weight=0.0)

@@ -26,7 +26,8 @@ from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.numerics.tables import Chosen
 from directshape_torch.refinement.problem import CarIterations, CarMinimum, CarProblem, CarStage
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.solver.gauss_newton import minimise
 from directshape_torch.state.cars import CarState

@@ -24,7 +24,8 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 
 
 def refiner(config: RefinerConfig = DEFAULT) -> DirectShapeRefiner:

@@ -26,7 +26,8 @@ from directshape_torch.errors import ConfigError, InputError
 from directshape_torch.geometry import se3
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import Detections, FrameBatch, Occluders
+from directshape_torch.scene.detections import Detections, Occluders
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.status import Status
 
 

@@ -23,7 +23,8 @@ from directshape_torch.io.kitti_labels import KittiObject, own_boxes_2d, poses_c
 from directshape_torch.io.mask_matching import MIN_OVERLAP, assign
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.io.velodyne import lidar_pose, points_by_columns, read_points
-from directshape_torch.scene import MOST_TELLING, SIDES
+from directshape_torch.scene.detections import MOST_TELLING
+from directshape_torch.scene.frames import SIDES
 from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence, Pair, Scan, reread_boxes
 from directshape_torch.scene_check.check_images import (
     SPOILS_CAMERA,

@@ -15,7 +15,7 @@ from directshape_torch.config import PointCloudConfig
 from directshape_torch.evaluation.shape_error import EstimatedCar
 from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.masks import MASK_THRESHOLD
+from directshape_torch.scene.masks import MASK_THRESHOLD
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.shape.zero_level import sdf_to_mesh
 from directshape_torch.stereo_matching.disparity import with_disparity

@@ -17,8 +17,8 @@ from directshape_torch.export.frame_source import Exporter, FrameSource
 from directshape_torch.export.painted_cars import ground_grid
 from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.scene.masks import MASK_THRESHOLD
 from directshape_torch.stereo_matching.disparity import rgb8
 from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Colour
 from directshape_torch.visualize.drawn_car import cars_of_result

@@ -29,7 +29,7 @@ from directshape_torch.io.instance_masks import (
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera, upright_plane
 from directshape_torch.io.kitti_labels import NO_BOX_3D, KittiObject, parse_object
 from directshape_torch.numerics.checks import is_no_rotation
-from directshape_torch.scene import SIDES, Side
+from directshape_torch.scene.frames import SIDES, Side
 
 FOLDER_SCHEMA_VERSION = 1
 _CURE = "see docs/plain_folder.md"

@@ -13,8 +13,9 @@ from torch.nn.functional import pad
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.masks import MaskCrops
-from directshape_torch.scene import Detections, FrameBatch, Occluders
+from directshape_torch.scene.detections import Detections, Occluders
+from directshape_torch.scene.frames import FrameBatch
+from directshape_torch.scene.masks import MaskCrops
 
 Size = tuple[int, int]  # height and width
 

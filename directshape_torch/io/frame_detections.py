@@ -12,8 +12,9 @@ from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.instance_masks import InstanceMask
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam
 from directshape_torch.io.mask_matching import MaskMatches, distinct, hiding, match_masks
-from directshape_torch.masks import MaskCrops
-from directshape_torch.scene import SIDES, Detections, Occluders
+from directshape_torch.scene.detections import Detections, Occluders
+from directshape_torch.scene.frames import SIDES
+from directshape_torch.scene.masks import MaskCrops
 
 
 @dataclass(frozen=True)

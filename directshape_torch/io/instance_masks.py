@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from directshape_torch.errors import DataFormatError, shown
 from directshape_torch.files.find_files import found
 from directshape_torch.io.image_files import read_single_channel
-from directshape_torch.masks import MASK_THRESHOLD
-from directshape_torch.scene import Side
+from directshape_torch.scene.frames import Side
+from directshape_torch.scene.masks import MASK_THRESHOLD
 
 Box = tuple[float, float, float, float]
 """This is (u_min, v_min, u_max, v_max), pixels."""

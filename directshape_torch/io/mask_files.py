@@ -27,7 +27,7 @@ from directshape_torch.io.instance_masks import (
     within_memory,
 )
 from directshape_torch.io.kitti_labels import frame_number
-from directshape_torch.scene import SIDES, Side
+from directshape_torch.scene.frames import SIDES, Side
 
 COCO_CAR_IDS = frozenset({3})
 # KITTI MOTS numbers its classes 1 car, 2 pedestrian, 10 ignore; Cityscapes numbers from 24 on, with 26 for car.

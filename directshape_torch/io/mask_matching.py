@@ -21,7 +21,7 @@ from directshape_torch.geometry.image_boxes import box_iou, box_outlines, enclos
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.instance_masks import InstanceMask
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam
-from directshape_torch.scene import SIDES, Side
+from directshape_torch.scene.frames import SIDES, Side
 
 MIN_OVERLAP = 0.35
 # Two masks of one image whose IoU is larger show the same object, which the segmentation found twice.

@@ -15,7 +15,8 @@ from directshape_torch.io.frame_detections import FrameDetections, mask_crops, o
 from directshape_torch.io.instance_masks import InstanceMask
 from directshape_torch.io.kitti_labels import NO_BOX_3D, KittiObject, parse_object
 from directshape_torch.io.mask_matching import distinct, right_masks
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 
 STARTED_CLASS = "Car"
 """Masks of cars become detections of this class."""

@@ -38,7 +38,8 @@ from directshape_torch.io.mask_matching import with_image_boxes
 from directshape_torch.io.mask_starts import STARTED_CLASS, detections_of_masks
 from directshape_torch.io.track_association import associate
 from directshape_torch.io.velodyne import in_image, read_scan
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.stereo_matching.plane_from_points import estimate_ground_plane
 
 GroundSource = Literal["auto", "file", "stereo", "camera_height"]

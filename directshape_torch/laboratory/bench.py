@@ -20,7 +20,7 @@ from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.refinement.problem import CarProblem, CarStage
 from directshape_torch.refinement.scene_problem import TermFactory, problem_of_scene
 from directshape_torch.rows import PixelSamples, PointSamples, Rays, Rows
-from directshape_torch.scene import Detections
+from directshape_torch.scene.detections import Detections
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.solver.sharing import Groups

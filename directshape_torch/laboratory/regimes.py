@@ -16,7 +16,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.laboratory.scenes import LaboratoryScene, place_cars, select_detections
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import Detections
+from directshape_torch.scene.detections import Detections
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.state.cars import CarState
 from directshape_torch.tracks.path import NUM_PATH

@@ -13,9 +13,10 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.geometry.projection import project, rays_from_pixels, right_rays
 from directshape_torch.io.stereo_dataset import open_dataset
-from directshape_torch.masks import MaskCrops
 from directshape_torch.rows import Rays, Rows
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
+from directshape_torch.scene.masks import MaskCrops
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.terms.depth import march

@@ -16,9 +16,10 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.masks import MASK_THRESHOLD, MaskCrops
 from directshape_torch.rows import OcclusionMap
-from directshape_torch.scene import Detections, Side
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import Side
+from directshape_torch.scene.masks import MASK_THRESHOLD, MaskCrops
 
 OcclusionOrder = Literal["depth", "box_bottom"]
 

@@ -20,7 +20,8 @@ from directshape_torch.numerics.records import Dense
 from directshape_torch.numerics.tables import Table
 from directshape_torch.observation.occlusion import occlusion_map
 from directshape_torch.rows import OcclusionMap, PixelSamples, PointSamples
-from directshape_torch.scene import SIDES, Detections, FrameBatch, Side
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import SIDES, FrameBatch, Side
 
 # A region extends beyond mask and box, on every side, by the larger of this many pixels and this share of its size.
 _MARGIN_PX, _MARGIN_SHARE = 4.0, 0.1

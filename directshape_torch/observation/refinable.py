@@ -13,7 +13,8 @@ from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import FOLLOWING
 from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.observation.packing import Observation
-from directshape_torch.scene import Detections, FrameBatch, Occluders
+from directshape_torch.scene.detections import Detections, Occluders
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.state.cars import CarBatch
 from directshape_torch.status import Status

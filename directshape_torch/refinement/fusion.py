@@ -26,7 +26,7 @@ from directshape_torch.state.unknowns import CODE, POSE, Unknowns
 
 if TYPE_CHECKING:
     from directshape_torch.refinement.result import RefinementResult
-    from directshape_torch.scene import Detections
+    from directshape_torch.scene.detections import Detections
 
 UNKNOWN_DETECTOR = torch.tensor([0.0260, 0.1558, 0.0779, 0.2078, 0.70, 0.16, 0.16], dtype=torch.float64)
 """These are the standard deviations of a detector of which nothing is known.

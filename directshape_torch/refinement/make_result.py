@@ -27,7 +27,8 @@ from directshape_torch.refinement.problem import CarMinimum, CarProblem, stage_o
 from directshape_torch.refinement.quality import fit_quality
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.trust import EVIDENCE_NAMES, bundled_trust_model
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.solver.sharing import INDEPENDENT

@@ -8,11 +8,11 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.numerics.records import CarRecord, Dense
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refinement.trust import bundled_trust_model
 from directshape_torch.rows import CarSums
+from directshape_torch.scene.masks import MASK_THRESHOLD
 from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.silhouette import MaskRows
 from directshape_torch.terms.term import Figures, Part, Prepared

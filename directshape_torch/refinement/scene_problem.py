@@ -17,7 +17,8 @@ from directshape_torch.numerics.checks import check_rows, check_shape
 from directshape_torch.observation.packing import Observation
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.rows import Rows
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.state.cars import CarBatch, CarState

@@ -8,10 +8,11 @@ from torch import Tensor
 from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.geometry.projection import project, rays_from_pixels
 from directshape_torch.geometry.se3 import inverse, transform
-from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.rig.rig import Rig
 from directshape_torch.rows import ObjectRays
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
+from directshape_torch.scene.masks import MASK_THRESHOLD
 from directshape_torch.stereo_matching.disparity import rgb8
 from directshape_torch.stereo_matching.patch_alignment import MatchedPair
 

@@ -20,7 +20,8 @@ from directshape_torch.rig.detections import COLUMNS, observe_detections
 from directshape_torch.rig.pixels import PixelEvidence, hull
 from directshape_torch.rig.posterior import BIAS, Posterior, solve_offsets, solve_rows
 from directshape_torch.rig.rig import Rig
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 
 if TYPE_CHECKING:
     from directshape_torch.refinement.result import RefinementResult

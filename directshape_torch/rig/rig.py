@@ -9,7 +9,7 @@ from torch import Tensor
 
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.geometry.stereo_depth import depth_from_disparity, disparity_of_depth
-from directshape_torch.scene import FrameBatch
+from directshape_torch.scene.frames import FrameBatch
 
 
 class Rig(NamedTuple):

@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from directshape_torch.rig import detector_noise
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.rig import Rig
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 
 if TYPE_CHECKING:
     from directshape_torch.refinement.result import RefinementResult

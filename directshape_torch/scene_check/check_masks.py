@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from directshape_torch.geometry.image_boxes import box_iou
-from directshape_torch.scene import SIDES, Side
+from directshape_torch.scene.frames import SIDES, Side
 from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence
 from directshape_torch.scene_check.conventions import projected_boxes
 from directshape_torch.scene_check.finding import Finding, Severity, found, of_cars

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from directshape_torch.numerics.checks import check_type
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.scene_check.car_evidence import FrameEvidence, evidence_of_scene
 from directshape_torch.scene_check.check_boxes import check_box_2d, check_boxes, check_corners
 from directshape_torch.scene_check.check_images import (

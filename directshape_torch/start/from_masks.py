@@ -9,9 +9,10 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.box3d import pose_from_kitti, wrap_angle
-from directshape_torch.masks import MaskCrops
 from directshape_torch.numerics.full_precision import in_full_precision
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
+from directshape_torch.scene.masks import MaskCrops
 from directshape_torch.start.mask_points import MaskPoints, points_under
 from directshape_torch.start.rectangle_fit import MEAN_HWL, InstancePoints, fit_rectangles
 from directshape_torch.stereo_matching.disparity import with_disparity

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from directshape_torch.geometry.stereo_depth import points_from_disparity
-from directshape_torch.masks import MASK_THRESHOLD, MaskCrops
-from directshape_torch.scene import FrameBatch
+from directshape_torch.scene.frames import FrameBatch
+from directshape_torch.scene.masks import MASK_THRESHOLD, MaskCrops
 
 # At most 1600 pixels of a mask are examined, and at most 100 of those with a disparity become points.
 _MOST_PIXELS, _MOST_POINTS = 1600, 200

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from directshape_torch.numerics.records import Dense
 from directshape_torch.numerics.tables import Table
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.state.unknowns import Unknowns, blocks_of_car
 
 

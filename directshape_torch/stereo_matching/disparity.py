@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.scene import FrameBatch
+from directshape_torch.scene.frames import FrameBatch
 
 _BLOCK_SIZE_PX = 5
 _UNIQUENESS_PERCENT = 10

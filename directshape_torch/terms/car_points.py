@@ -10,10 +10,11 @@ from torch import Tensor
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.stereo_depth import points_from_disparity
-from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.rows import PointSamples
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
+from directshape_torch.scene.masks import MASK_THRESHOLD
 
 # About this many pixels are processed at once; each takes about 200 bytes.
 _MOST_PIXELS = 2**20

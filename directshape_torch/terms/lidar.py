@@ -10,10 +10,11 @@ from torch import Tensor
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.projection import project
-from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.rows import PointSamples
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
+from directshape_torch.scene.masks import MASK_THRESHOLD
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.state.cars import CarBatch
 from directshape_torch.terms.car_points import every_nth, stands_at

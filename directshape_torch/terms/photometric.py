@@ -18,12 +18,12 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import PhotometricConfig, StageConfig
-from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.numerics.records import Dense
 from directshape_torch.numerics.tables import Table
 from directshape_torch.numerics.tensors import length, occurrences
 from directshape_torch.rows import BLOCK, Blocks, CarSums, ObjectRays, Rays, Rows
+from directshape_torch.scene.masks import MASK_THRESHOLD
 from directshape_torch.shape.field import Field
 from directshape_torch.state.cars import CarBatch
 from directshape_torch.state.unknowns import CODE, OFFSET, POSE, State

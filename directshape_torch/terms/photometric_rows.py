@@ -15,11 +15,11 @@ from torch import Tensor
 from directshape_torch.config import PhotometricConfig
 from directshape_torch.image.grey_levels import GreyPair
 from directshape_torch.image.interpolate import BilinearPatch, bilinear_patch
-from directshape_torch.masks import MASK_THRESHOLD, MaskCrops
 from directshape_torch.numerics.records import Dense
 from directshape_torch.numerics.tables import Table
 from directshape_torch.numerics.tensors import all_along, made_once
 from directshape_torch.rows import OcclusionMap, PixelSamples, Rays, Rows
+from directshape_torch.scene.masks import MASK_THRESHOLD, MaskCrops
 from directshape_torch.state.cars import CarBatch
 
 # This is DSO's pattern of 8 neighbourhood pixels (Engel et al., Direct Sparse Odometry, fig. 4), as (du, dv).

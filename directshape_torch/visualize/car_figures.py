@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from directshape_torch.config import SamplingMode
 from directshape_torch.errors import InputError
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.observation.packing import pack_pixels, residual_offsets
-from directshape_torch.scene import SIDES, Side
+from directshape_torch.scene.frames import SIDES, Side
+from directshape_torch.scene.masks import MASK_THRESHOLD
 from directshape_torch.visualize.drawing import (
     BLUE,
     GREEN,

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from directshape_torch.errors import InputError
 from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.geometry.box3d import BOX_EDGES
-from directshape_torch.scene import FrameBatch, Side
+from directshape_torch.scene.frames import FrameBatch, Side
 from directshape_torch.stereo_matching.disparity import rgb8
 
 if TYPE_CHECKING:

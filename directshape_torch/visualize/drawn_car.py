@@ -16,7 +16,7 @@ from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.kitti_labels import KittiObject, box_corners_cam, poses_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refinement.result import RefinementResult
-from directshape_torch.scene import Detections
+from directshape_torch.scene.detections import Detections
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.shape.zero_level import sdf_to_mesh
 from directshape_torch.status import Status

@@ -13,7 +13,8 @@ from directshape_torch.errors import InputError, shown
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.numerics.checks import check_type
 from directshape_torch.refinement.result import RefinementResult
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.visualize.drawing import (
     BLUE,
     GREEN,

@@ -16,7 +16,8 @@ from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.refinement.problem import CarMinimum, CarStage, stage_of
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.solver.gauss_newton import minimise
 from directshape_torch.solver.problem import put_rows, where_rows
 from directshape_torch.state.cars import CarState

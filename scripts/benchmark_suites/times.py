@@ -15,7 +15,8 @@ from directshape_torch.compile import compiler_problem
 from directshape_torch.io.config_files import load_config
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 
 _BATCH_FRAMES = 8  # of a call that refines a data set without waiting for single frames
 _PRESETS = ("default", "fast")

@@ -27,7 +27,8 @@ from directshape_torch.rig.detector_noise import detector_sigmas, rows_of
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.from_files import estimate_rigs
 from directshape_torch.rig.rigs import RigEstimates
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.state.cars import CarBatch
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ from directshape_torch.files.atomic_files import write_text
 from directshape_torch.geometry.box3d import alpha_from_kitti, box_corners, pose_from_kitti, wrap_angle
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.stereo_dataset import StereoDataset
-from directshape_torch.scene import FrameBatch
+from directshape_torch.scene.frames import FrameBatch
 
 _MEAN_HWL, _SIZE_SHARE = (1.53, 1.63, 3.88), 0.03
 _LEAST_HEIGHT_PX = 25.0

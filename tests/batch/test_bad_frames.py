@@ -19,7 +19,7 @@ from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.errors import DirectShapeError
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.refinement.result import RefinementResult
-from directshape_torch.scene import FrameBatch
+from directshape_torch.scene.frames import FrameBatch
 
 
 def test_a_truncated_image_is_reported_and_the_others_go_on(kitti_copy: Path, tmp_path: Path) -> None:

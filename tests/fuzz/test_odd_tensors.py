@@ -16,7 +16,7 @@ from tensor_values import MUTATIONS
 
 from directshape_torch import Detections, DirectShapeRefiner
 from directshape_torch.errors import DirectShapeError, InputError
-from directshape_torch.scene import FrameBatch
+from directshape_torch.scene.frames import FrameBatch
 
 # Making odd tensors, PyTorch says that they are young, or old.
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:torch", "ignore:.*(prototype|beta|deprecated):UserWarning")

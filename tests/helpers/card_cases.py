@@ -24,10 +24,11 @@ from torch import Tensor
 from directshape_torch.cli.main import main as command
 from directshape_torch.config import RefinerConfig
 from directshape_torch.io.config_files import load_config
-from directshape_torch.masks import MaskCrops
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
+from directshape_torch.scene.masks import MaskCrops
 from directshape_torch.shape.shape_prior import ShapePrior
 from helpers.five_cars import five_cars, with_solver
 from helpers.pretended_card import CARD, CardTensor, noted_waits, pretended_card

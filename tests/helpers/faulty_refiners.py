@@ -15,7 +15,7 @@ from directshape_torch.config import RefinerConfig
 from directshape_torch.io.config_files import load_config
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import FrameBatch
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 # The model of trust does not know toys that have not converged.

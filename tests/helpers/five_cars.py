@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.synthetic_scene import CAMERA_HEIGHT_M, disturbed, joined_detections, joined_frames, street

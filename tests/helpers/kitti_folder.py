@@ -11,7 +11,7 @@ from torch import Tensor
 
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
-from directshape_torch.scene import Detections
+from directshape_torch.scene.detections import Detections
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.synthetic_scene import TWO_CARS, Street, disturbed, street

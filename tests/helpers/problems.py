@@ -12,7 +12,8 @@ from directshape_torch.config import AcceptanceConfig, RefinerConfig, RigConfig,
 from directshape_torch.io.config_files import load_config
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.state.cars import CarState
 from directshape_torch.terms.photometric import Photometric, PhotometricEvidence

@@ -16,7 +16,8 @@ from directshape_torch.geometry.projection import project, rays_from_pixels, rig
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.geometry.stereo_depth import disparity_of_depth
 from directshape_torch.laboratory.scenes import select_detections
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 CAMERA_HEIGHT_M = 1.65

@@ -18,7 +18,7 @@ from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.instance_masks import InstanceMask
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
 from directshape_torch.io.mask_matching import MaskMatches, assign, distinct, hiding, mask_iou, match_masks
-from directshape_torch.scene import Side
+from directshape_torch.scene.frames import Side
 
 SIZE_HW = (200, 600)
 Box = tuple[float, float, float, float]

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.observation.occlusion import OcclusionOrder, occlusion_map
-from directshape_torch.scene import Detections, Occluders, Side
+from directshape_torch.scene.detections import Detections, Occluders
+from directshape_torch.scene.frames import Side
 
 HEIGHT, WIDTH = 20, 30
 

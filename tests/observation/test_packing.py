@@ -15,9 +15,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from directshape_torch.config import SamplingConfig
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.ground_plane import GroundPlane
-from directshape_torch.masks import MaskCrops
 from directshape_torch.observation.packing import Observation, car_regions, pack_pixels, region_boxes
-from directshape_torch.scene import Detections, FrameBatch, Occluders, Side
+from directshape_torch.scene.detections import Detections, Occluders
+from directshape_torch.scene.frames import FrameBatch, Side
+from directshape_torch.scene.masks import MaskCrops
 from tests.helpers.synthetic_scene import stereo_camera
 
 PADDING = 0.77  # grey that must not matter

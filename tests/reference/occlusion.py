@@ -7,9 +7,10 @@ import math
 import torch
 from torch import Tensor
 
-from directshape_torch.masks import MASK_THRESHOLD
 from directshape_torch.observation.occlusion import OcclusionOrder
-from directshape_torch.scene import Detections, Side
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import Side
+from directshape_torch.scene.masks import MASK_THRESHOLD
 
 
 def instances_in_front(detections: Detections, side: Side, order: OcclusionOrder = "depth") -> Tensor:

@@ -14,7 +14,7 @@ from directshape_torch.config import AcceptanceConfig, BackwardConfig, RefinerCo
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.trust import EVIDENCE_NAMES
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import Detections
+from directshape_torch.scene.detections import Detections
 from directshape_torch.status import Status
 
 

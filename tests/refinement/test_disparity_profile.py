@@ -25,7 +25,7 @@ from directshape_torch.refinement.disparity_profile import (
 )
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import FrameBatch
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.state.cars import CarState
 from directshape_torch.terms.photometric import Surface
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from directshape_torch.refinement.disparity_profile import disparity_profile
 from directshape_torch.refinement.quality import FitQuality, fit_quality, photometric_agreement
 from directshape_torch.refinement.trust import EVIDENCE_NAMES
-from directshape_torch.scene import FrameBatch
+from directshape_torch.scene.frames import FrameBatch
 
 
 def halves_apart(frames: FrameBatch) -> Tensor:

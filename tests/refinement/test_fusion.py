@@ -16,7 +16,7 @@ from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.refinement.fusion import UNKNOWN_DETECTOR, compared, fused, noise_of_boxes
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.trust import bundled_trust_model
-from directshape_torch.scene import Detections
+from directshape_torch.scene.detections import Detections
 from directshape_torch.state.cars import CarBatch
 from directshape_torch.status import Status
 

@@ -16,7 +16,8 @@ from directshape_torch import DirectShapeRefiner, RigEstimate, check_scene
 from directshape_torch.errors import InputError
 from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
 from directshape_torch.rig.detections import observe_detections, size_error
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 
 DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 DISPARITY, OFFSET, ROW_OFFSET = 2, 3, 5

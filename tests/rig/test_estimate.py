@@ -21,7 +21,7 @@ from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.rig.from_files import estimate_rigs
 from directshape_torch.rig.pixels import pixel_evidence
 from directshape_torch.rig.rig_file import load_fields, load_rigs, save_field, save_rigs
-from directshape_torch.scene import Detections
+from directshape_torch.scene.detections import Detections
 from directshape_torch.state.cars import CarBatch
 
 PLACES = torch.tensor([[200.0, 190], [450, 190], [620, 190], [800, 190], [1050, 190]], dtype=torch.float64)

@@ -18,7 +18,8 @@ from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rows import Rays
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.state.cars import CarState
 

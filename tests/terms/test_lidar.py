@@ -13,7 +13,7 @@ from torch import Tensor
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.projection import rays_from_pixels
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import FrameBatch
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.terms.lidar import LidarPoints, lidar_points
 
 PRIOR = ellipsoid_prior()

@@ -21,7 +21,8 @@ from directshape_torch.numerics.records import Dense
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.state.cars import CarBatch, CarState
 from directshape_torch.terms.priors import PriorResidual, PriorTerm
 

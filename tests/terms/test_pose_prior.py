@@ -19,7 +19,7 @@ from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.errors import InputError
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import Detections
+from directshape_torch.scene.detections import Detections
 
 SIGMA = torch.tensor([0.3, 0.1, 0.05, 0.06], dtype=torch.float64)
 

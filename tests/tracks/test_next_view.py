@@ -17,7 +17,8 @@ from directshape_torch.geometry import se3
 from directshape_torch.numerics.tables import Chosen
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.shape.field import field_of
 from directshape_torch.terms.photometric import Brightness, PhotometricEvidence
 from directshape_torch.terms.term import Prepared

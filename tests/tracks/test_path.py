@@ -20,7 +20,8 @@ from directshape_torch.geometry import se3
 from directshape_torch.numerics.tables import take_rows
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.solver.sharing import Groups
 from directshape_torch.state.cars import CarBatch, CarState
 from directshape_torch.tracks.path import hold_of_path, motion_terms, timed, with_path

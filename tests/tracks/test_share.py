@@ -34,7 +34,8 @@ from directshape_torch.refinement.problem import CarMinimum, CarProblem
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.trust import EVIDENCE_NAMES
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene.detections import Detections
+from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.solver.sharing import Groups
 from directshape_torch.state.unknowns import POSE, AnyState

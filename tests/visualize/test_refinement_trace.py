@@ -13,7 +13,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.io.config_files import load_config
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene import Detections
+from directshape_torch.scene.detections import Detections
 from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.masks import MaskCrops
+from directshape_torch.scene.masks import MaskCrops
 
 
 def plain_extents(masks: Tensor) -> tuple[list[list[int]], list[int]]:

@@ -19,7 +19,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.ground_plane import GroundPlane
 from directshape_torch.geometry.projection import project
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.scene import Detections, Occluders
+from directshape_torch.scene.detections import Detections, Occluders
 from directshape_torch.status import Status
 
 

@@ -1,0 +1,1 @@
+"""This package holds what a refinement is given: frames, masks and detections."""
