@@ -40,6 +40,8 @@ def test_notebook(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
     assert (names["after_m"][names["result"].refined] < 0.3).all()
     assert names["result"].refined.sum() >= 5
     assert names["after_m"].mean() < 0.5 * names["before_m"].mean()
+    # Masks alone are as good as boxes.
+    assert names["found_m"].mean() < names["start_m"].mean() < 0.5
     # All seven numbers of a box are trained.
     gradient = names["gradient"]
     assert torch.isfinite(gradient).all()
