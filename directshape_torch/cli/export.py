@@ -1,8 +1,8 @@
 """`directshape export`: a finished run for other programs.
 
 Write the finished frames of an output folder of 'directshape refine' for other programs: surfaces as GLB or PLY and
-points as PLY, coloured by the left image; boxes as KITTI, COCO-3D or nuScenes files; and all of these as a recording
-for Rerun's viewer. OUT itself is only read. docs/outputs.md gives the coordinate frame of each file.
+points as PLY, coloured by the left image; boxes as KITTI files; and all of these as a recording for
+Rerun's viewer. OUT itself is only read. docs/outputs.md gives the coordinate frame of each file.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets the files")
     parser.add_argument("--frames", nargs="+", metavar="ID", help="only these frames (default: all that are finished)")
     inputs = parser.add_argument_group("input")
-    add_run_inputs(inputs, "for colours; coco3d and rerun need it")
+    add_run_inputs(inputs, "for colours; rerun needs it")
     inputs.add_argument(
         "--disparity", type=Path, metavar="DIR", help="disparity maps, for the stereo points of 'points'"
     )
@@ -67,7 +67,7 @@ def _make_options(args: argparse.Namespace, inputs: RunInputs) -> ExportOptions:
         purpose = "stereo points" if "points" in args.format else "--iterations"
         raise InputError("--rig", f"the file that the run was made with, for {purpose}", "nothing")
     refiner = _make_refiner(args, inputs) if args.iterations else None
-    return ExportOptions(args.data, refiner, args.unseen == "mirror", args.points)
+    return ExportOptions(refiner, args.unseen == "mirror", args.points)
 
 
 def _make_refiner(args: argparse.Namespace, inputs: RunInputs) -> DirectShapeRefiner:

@@ -7,8 +7,8 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from directshape_torch.errors import InputError
-from directshape_torch.export.box_files import Coco3dExporter, KittiExporter, NuscenesExporter
 from directshape_torch.export.frame_source import Exporter, ExportOptions, FrameSource
+from directshape_torch.export.kitti_files import KittiExporter
 from directshape_torch.export.rerun_recording import RerunExporter
 from directshape_torch.export.surface_files import GlbExporter, PlyExporter, PointsExporter
 from directshape_torch.files.atomic_files import check_folder
@@ -19,8 +19,6 @@ FORMATS: dict[str, type[Exporter]] = {
     "ply": PlyExporter,
     "points": PointsExporter,
     "kitti": KittiExporter,
-    "coco3d": Coco3dExporter,
-    "nuscenes": NuscenesExporter,
     "rerun": RerunExporter,
 }
 """These are the formats of `export_run` (docs/outputs.md)."""
@@ -37,8 +35,8 @@ def export_run(
 
     Args:
         inputs: chosen frames of an output folder, shape prior, and the images for colours.
-        folder: folder of `glb`, `ply`, `points`, `kitti`, `coco3d.json`, `nuscenes.json`, `recording.rrd`; existing
-            files with the same names are replaced.
+        folder: folder of `glb`, `ply`, `points`, `kitti` and `recording.rrd`; existing files with the same names are
+            replaced.
         formats: names out of `FORMATS`.
         options: appearance and details.
         tell: function that is called after each frame.

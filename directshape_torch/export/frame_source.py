@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +19,6 @@ from directshape_torch.visualize.run_frames import RunFrame, RunInputs
 class ExportOptions:
     """An `ExportOptions` has the choices for an export."""
 
-    data_root: Path | None = None  # folder to which listed image paths are relative
     # Refiner that repeats the refinement, for the iterations in a recording; it needs the detections of the run.
     refiner: DirectShapeRefiner | None = None
     mirror: bool = True  # whether to colour unseen parts by the other side of the car
@@ -89,3 +89,15 @@ class Exporter:
 
     def abandon(self) -> None:
         """Remove unfinished files, because a frame or another exporter failed."""
+
+
+def frame_numbers(frame_ids: Sequence[str]) -> dict[str, int]:
+    """The numbers in the ids of frames, or 1, 2, .. if the ids are not distinct numbers.
+
+    Examples:
+        >>> frame_numbers(["000107", "007322"])
+        {'000107': 107, '007322': 7322}
+    """
+    if all(one.isdigit() for one in frame_ids) and len({int(one) for one in frame_ids}) == len(frame_ids):
+        return {one: int(one) for one in frame_ids}
+    return {one: number for number, one in enumerate(frame_ids, start=1)}

@@ -12,8 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.errors import MissingDependencyError
-from directshape_torch.export.box_files import image_numbers
-from directshape_torch.export.frame_source import Exporter, FrameSource
+from directshape_torch.export.frame_source import Exporter, FrameSource, frame_numbers
 from directshape_torch.export.painted_cars import ground_grid
 from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.io.stereo_dataset import LoadedFrame
@@ -53,7 +52,7 @@ class RerunExporter(Exporter):
     def __init__(self, *args: Any) -> None:
         _import_rerun()
         super().__init__(*args)
-        self.numbers, self.iteration = image_numbers(self.inputs.run.frame_ids), 0
+        self.numbers, self.iteration = frame_numbers(self.inputs.run.frame_ids), 0
         self._stream: _Stream | None = None
 
     def add(self, source: FrameSource) -> None:

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.export.box_files import image_numbers
-from directshape_torch.export.frame_source import Exporter, FrameSource
+from directshape_torch.export.frame_source import Exporter, FrameSource, frame_numbers
 from directshape_torch.export.painted_cars import SEEN, Paint, PaintedFrame, ground_grid
 from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.files.mesh_files import T_GLTF_CAM
@@ -115,7 +114,7 @@ class _MovingCar:
         place: Callable[..., None] = scene.graph.update
         place(frame_to=_CAMERA, matrix=T_GLTF_CAM)
         _add(scene, _CAR, mesh, paint, _CAMERA)
-        numbers = image_numbers([frame_id.removeprefix(f"{sequence}_") for frame_id in self.T_cam_obj])
+        numbers = frame_numbers([frame_id.removeprefix(f"{sequence}_") for frame_id in self.T_cam_obj])
         seconds, T_views = np.array(self.time_s), np.stack(list(self.T_cam_obj.values()))
         # Unknown times and times that do not increase are not used, since glTF animations must not have them.
         if not (np.diff(seconds) > 0).all():

@@ -19,7 +19,7 @@ FILE = "{root}/prior.safetensors"
 MASKED = f"{REFINE} --masks {{root}}/masks"
 
 CASES = [
-    (f"{EXPORT} --format coco3d", "--data: expected the data set of the run, for the sizes"),
+    (f"{EXPORT} --format rerun", "--data: expected the data set of the run, for the pictures of a recording"),
     (f"{EXPORT} --format ply --masks x", "--data: expected the data set of the run, because of --masks"),
     (f"{EXPORT} --format ply --masks-left x", "because of --masks-left"),
     (f"{EXPORT} --format ply --iterations", "--iterations: expected --format rerun, which alone records them, got ply"),

@@ -25,8 +25,6 @@ from directshape_torch.export.painted_cars import SEEN, PaintedFrame
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.config_files import config_from_mapping
 from directshape_torch.io.kitti_labels import read_objects
-from directshape_torch.io.result_files import read_shapes, write_shapes
-from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -248,11 +246,8 @@ def test_without_a_refiner_there_are_frames_alone(finished: FinishedRun, tmp_pat
 
 
 def test_a_car_moves_under_the_name_of_its_track(finished: FinishedRun, tmp_path: Path) -> None:
-    shutil.copytree(finished.out, tmp_path / "run")
-    for frame in ("000000", "000001"):
-        path = tmp_path / "run" / "shapes" / f"{frame}.npz"
-        write_shapes(path, replace(read_shapes(path), tracks=("000007", "")))
-    export_run(finished.inputs(RunFolder(tmp_path / "run")), tmp_path, ["rerun"])
+    run = finished.with_tracks(tmp_path / "run", ("000007", ""), [(0, -1), (0, -1)])
+    export_run(finished.inputs(run), tmp_path, ["rerun"])
     recording = Recording(tmp_path / "recording.rrd")
     assert {place[0] for place in recording.of("/world/cars/track_000007", "vertex_positions")} == {0, 1}
 
@@ -270,12 +265,12 @@ def test_a_damaged_image_leaves_no_file(finished: FinishedRun, tmp_path: Path) -
 def test_an_end_that_fails_leaves_nothing_half_written(
     finished: FinishedRun, tmp_path: Path, recording_first: bool
 ) -> None:
-    (tmp_path / "coco3d.json").mkdir()
-    formats = ["rerun", "coco3d"] if recording_first else ["coco3d", "rerun"]
-    with pytest.raises(OSError, match=r"coco3d\.json"):
-        export_run(finished.inputs(RunFolder(finished.out, [0])), tmp_path, formats)
-    left = {path.name for path in tmp_path.iterdir()}
-    assert left == ({"coco3d.json", "recording.rrd"} if recording_first else {"coco3d.json"})
+    run, out = finished.with_tracks(tmp_path / "run", ("000007", ""), [(0, -1), (0, -1)]), tmp_path / "out"
+    (out / "glb" / "track_000007.glb").mkdir(parents=True)
+    formats = ["rerun", "glb"] if recording_first else ["glb", "rerun"]
+    with pytest.raises(OSError, match=r"track_000007\.glb"):
+        export_run(finished.inputs(run), out, formats)
+    assert {path.name for path in out.iterdir()} == ({"glb", "recording.rrd"} if recording_first else {"glb"})
 
 
 def test_without_rerun_the_error_says_what_to_install(

@@ -179,17 +179,6 @@ def test_glb_carries_what_is_known_of_a_car(finished: FinishedRun, exported: Pat
     np.testing.assert_allclose(extras["dimensions_hwl_m"], arrays["boxes_hwl"][1])
 
 
-def with_tracks(
-    finished: FinishedRun, folder: Path, tracks: tuple[str, str], parts: Sequence[Sequence[int]]
-) -> RunFolder:
-    """A copy of the run whose cars have tracks, with `parts` for each frame."""
-    shutil.copytree(finished.out, folder)
-    for frame_id, part in zip(("000000", "000001"), parts, strict=True):
-        path = folder / "shapes" / f"{frame_id}.npz"
-        write_shapes(path, replace(read_shapes(path), tracks=tracks, track_parts=np.array(part)))
-    return RunFolder(folder)
-
-
 # Times that do not go on, as a folder's frames may have them, cannot be those of an animation.
 @pytest.mark.parametrize(("interval_s", "played_s"), [(None, 0.1), (0.25, 0.25), (0.0, 0.1), (-0.25, 0.1)])
 def test_a_car_moves_through_the_poses_of_its_track(
@@ -198,7 +187,7 @@ def test_a_car_moves_through_the_poses_of_its_track(
     if interval_s is not None:
         motion = {"000000": (7.0, None), "000001": (7.0 + interval_s, None)}
         monkeypatch.setattr(FrameFiles, "read_motion", lambda files: motion[files.stems[0]])
-    run = with_tracks(finished, tmp_path / "run", ("000007", ""), [(0, -1), (0, -1)])
+    run = finished.with_tracks(tmp_path / "run", ("000007", ""), [(0, -1), (0, -1)])
     export_run(finished.inputs(run), tmp_path, ["glb"])
     assert sorted(path.stem for path in (tmp_path / "glb").iterdir()) == ["000000", "000001", "track_000007"]
     file = glb(tmp_path / "glb" / "track_000007.glb")
@@ -227,7 +216,7 @@ def test_a_car_moves_through_the_poses_of_its_track(
 
 def test_what_shares_no_shape_does_not_move(finished: FinishedRun, tmp_path: Path) -> None:
     """Of a track that was split each part is a car, if it has two views; its name says which."""
-    run = with_tracks(finished, tmp_path / "run", ("000007", "000008"), [(2, 0), (2, 1)])
+    run = finished.with_tracks(tmp_path / "run", ("000007", "000008"), [(2, 0), (2, 1)])
     export_run(finished.inputs(run), tmp_path, ["glb"])
     moving = [path.stem for path in (tmp_path / "glb").iterdir() if path.stem.startswith("track")]
     assert moving == ["track_000007_part2"]

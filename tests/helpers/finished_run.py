@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import base64
+import shutil
 import zlib
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
+from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -40,6 +43,14 @@ class FinishedRun:
 
     def folder(self, *frames: str) -> RunFolder:
         return RunFolder(self.out, frames or None)
+
+    def with_tracks(self, folder: Path, tracks: tuple[str, str], parts: Sequence[Sequence[int]]) -> RunFolder:
+        """A copy of the run whose cars have tracks, with `parts` for each frame."""
+        shutil.copytree(self.out, folder)
+        for frame_id, part in zip(FRAMES, parts, strict=True):
+            path = folder / "shapes" / f"{frame_id}.npz"
+            write_shapes(path, replace(read_shapes(path), tracks=tracks, track_parts=np.array(part)))
+        return RunFolder(folder)
 
     def state(self, frame_id: str) -> dict[str, NDArray[Any]]:
         """The content of the npz of a frame."""
