@@ -155,6 +155,7 @@ def _shape_arrays(loaded: LoadedFrame, result: RefinementResult, boxes: KittiBox
         matched_shares=_numpy(result.quality.matched_share),
         probabilities_better=_numpy(result.quality.probability_better),
         probabilities_not_worse=_numpy(result.quality.probability_not_worse),
+        probabilities_heading=_numpy(result.quality.probability_heading),
         distances_in_sigmas=_numpy(result.comparison.distance_in_sigmas),
         sigmas_ref=_numpy(result.sigma_xyz_yaw),
         unseen=tuple(result.observability.words()),

@@ -1,4 +1,4 @@
-"""This module reads and writes KITTI result files, states and shapes of frames (schema 4), and tracks."""
+"""This module reads and writes KITTI result files, states and shapes of frames (schema 5), and tracks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from directshape_torch.files.array_files import read_npz, write_npz
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.status import Status
 
-SHAPES_SCHEMA_VERSION = 4
+SHAPES_SCHEMA_VERSION = 5
 TRACK_SCHEMA_VERSION = 1
 _AGAIN = "refine the frame again"
 
@@ -110,6 +110,7 @@ class ShapeArrays:
     # Calibrated probabilities, see `FitQuality`.
     probabilities_better: Floats = field(metadata=shaped("B"))
     probabilities_not_worse: Floats = field(metadata=shaped("B"))
+    probabilities_heading: Floats = field(metadata=shaped("B"))
     # Distance between the boxes of images and detector, in standard deviations of both; NaN if these are not known.
     distances_in_sigmas: Floats = field(metadata=shaped("B"))
     # Calibrated standard deviations of (x, y, z, yaw) in `ref`, metres and radians.

@@ -37,6 +37,8 @@ class FitQuality(CarRecord):
         probability_not_worse: (B,) calibrated probability that the overlap of the returned box is at least the input's
             overlap minus 0.05. For cars with status `not_trusted` or `no_car` all figures belong to the refinement that
             was not returned.
+        probability_heading: (B,) calibrated probability that the front of the car is where the result has it, and not
+            at the opposite end. It is 0.5 where the images cannot tell, and NaN where only one sense was tried.
     """
 
     mask_iou_left: Annotated[Tensor, Dense("B")]
@@ -46,6 +48,7 @@ class FitQuality(CarRecord):
     evidence: Annotated[Tensor, Dense("B", "E")]
     probability_better: Annotated[Tensor, Dense("B")]
     probability_not_worse: Annotated[Tensor, Dense("B")]
+    probability_heading: Annotated[Tensor, Dense("B")]
 
 
 @torch.no_grad()
@@ -81,7 +84,8 @@ def fit_quality(
     names = stage.problem.term_names
     if not {"silhouette_left", "photometric"} <= set(names) or "point_cloud" in names:
         is_there = torch.full_like(is_there, torch.nan)
-    return FitQuality(left, right, error, share, evidence, *(is_there * chance for chance in chances))
+    better, not_worse = (is_there * chance for chance in chances)
+    return FitQuality(left, right, error, share, evidence, better, not_worse, torch.full_like(left, torch.nan))
 
 
 def mask_ious(masks: MaskRows, prepared: Prepared) -> Tensor:

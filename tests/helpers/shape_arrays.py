@@ -42,6 +42,7 @@ def shape_arrays(num_cars: int, **changes: Any) -> ShapeArrays:
         matched_shares=np.ones(B),
         probabilities_better=np.full(B, 0.9),
         probabilities_not_worse=np.full(B, 0.97),
+        probabilities_heading=np.full(B, np.nan),
         distances_in_sigmas=np.full(B, 2.6),
         sigmas_ref=random.random((B, 4)),
         unseen=("rear view: length alone (sigma 0.20 m)", "", "")[:B],

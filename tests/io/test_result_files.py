@@ -58,7 +58,7 @@ def test_shapes_round_trip_and_equal_bytes(tmp_path: Path, num_cars: int) -> Non
         else:
             assert before == after
     with np.load(tmp_path / "a.npz", allow_pickle=False) as archive:
-        assert int(archive["schema_version"]) == 4
+        assert int(archive["schema_version"]) == 5
 
 
 def test_shapes_of_wrong_size() -> None:
@@ -73,11 +73,11 @@ def test_files_that_are_no_shapes(tmp_path: Path) -> None:
     with pytest.raises(DataFormatError, match=r"a\.npz: cannot be read"):
         read_shapes(path)
     write_npz(path, {"codes": np.zeros(3)})
-    with pytest.raises(DataFormatError, match="has shape schema None, this version reads 4"):
+    with pytest.raises(DataFormatError, match="has shape schema None, this version reads 5"):
         read_shapes(path)
     write_npz(path, {"schema_version": np.array(1)})
-    with pytest.raises(DataFormatError, match="has shape schema 1, this version reads 4"):
+    with pytest.raises(DataFormatError, match="has shape schema 1, this version reads 5"):
         read_shapes(path)
-    write_npz(path, {"schema_version": np.array(4), "codes": np.zeros(3)})
+    write_npz(path, {"schema_version": np.array(5), "codes": np.zeros(3)})
     with pytest.raises(DataFormatError, match="has been changed since it was written"):
         read_shapes(path)
