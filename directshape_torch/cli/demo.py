@@ -21,11 +21,12 @@ from directshape_torch.cli.progress import ProgressBar
 from directshape_torch.evaluation.matching import match_to_labels
 from directshape_torch.evaluation.pose_error import CarErrors, errors_of
 from directshape_torch.evaluation.tables import align
-from directshape_torch.export.painted_cars import PaintedFrame
+from directshape_torch.export.frame_source import ExportOptions, FrameSource
 from directshape_torch.export.surface_files import frame_glb
 from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.io.run_folder import FrameResult, RunFolder
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset, open_dataset
+from directshape_torch.visualize.run_frames import RunInputs
 
 DEMO_FOLDER = Path(__file__).parent.parent / "assets" / "demo"
 
@@ -59,9 +60,9 @@ def run(args: argparse.Namespace) -> int:
     with ProgressBar() as progress, limited_threads(1):
         summary = refine_dataset(dataset, refiner, args.out, RefineOptions(overlays=True), progress, fresh=args.fresh)
         (frame_id,) = dataset.frame_ids
-        loaded, result = dataset.load(frame_id), RunFolder(args.out).read(frame_id)
-        write_bytes(args.out / "scene.glb", frame_glb(PaintedFrame(result, refiner.prior, loaded), loaded))
-    print(error_table(loaded, result))
+        frame = FrameSource(RunInputs(RunFolder(args.out), refiner.prior, dataset), frame_id, ExportOptions())
+        write_bytes(args.out / "scene.glb", frame_glb(frame))
+    print(error_table(frame.with_images, frame.result))
     print(format_summary(summary))
     print(f"picture  {args.out / 'overlays' / f'{frame_id}.png'}")
     print(f"scene    {args.out / 'scene.glb'}")

@@ -55,6 +55,11 @@ class FrameSource(RunFrame):
         return self.images
 
     @cached_property
+    def refined(self) -> list[int]:
+        """Rows of the refined cars, which are the cars of `painted`, in the same order."""
+        return [row for row, car in enumerate(self.after) if car.is_refined]
+
+    @cached_property
     def painted(self) -> PaintedFrame:
         """Surfaces with colours.
 
@@ -63,7 +68,8 @@ class FrameSource(RunFrame):
         """
         if self.inputs.prior is None:
             raise InputError("--prior", "the shape prior of the run", "nothing")
-        return PaintedFrame(self.result, self.inputs.prior, self.images, self.options.mirror)
+        cars = [self.after[row] for row in self.refined]
+        return PaintedFrame(cars, self.inputs.prior, self.images, self.options.mirror)
 
 
 class Exporter:

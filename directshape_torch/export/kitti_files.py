@@ -9,7 +9,7 @@ from directshape_torch.export.frame_source import Exporter, FrameSource
 from directshape_torch.files.atomic_files import write_bytes, write_json
 from directshape_torch.files.read_files import read_bytes
 from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.io.run_folder import COPIED, FrameResult, result_path
+from directshape_torch.io.run_folder import FrameResult, result_path
 
 _KITTI_FRAME = "ref: KITTI's rectified camera 0, x right, y down, z forward, metres and radians"
 
@@ -49,7 +49,7 @@ def _refinement(frame: FrameResult, line: KittiObject) -> dict[str, Any]:
     shapes = frame.shapes
     car = next((car for car, number in enumerate(shapes.input_lines) if number == line.line_number), None)
     if car is None:
-        return {"status": COPIED}
+        return {"status": "copied"}
     known = {
         "sigma_xyz_yaw": shapes.sigmas_ref[car],
         "probability_better": shapes.probabilities_better[car],

@@ -13,14 +13,13 @@ from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.evaluation.shape_error import EstimatedCar
-from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.scene.masks import MASK_THRESHOLD
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.shape.zero_level import sdf_to_mesh
 from directshape_torch.stereo_matching.disparity import with_disparity
 from directshape_torch.terms.car_points import car_points
 from directshape_torch.visualize.drawing import View
+from directshape_torch.visualize.drawn_car import DrawnCar
 
 if TYPE_CHECKING:
     import trimesh
@@ -98,27 +97,23 @@ class PaintedFrame:
     """A `PaintedFrame` has the refined cars of a frame with the colours of its left image.
 
     Args:
-        frame: results of the run.
+        cars: refined cars, with their shapes.
         prior: the prior of the refinement.
         loaded: images, calibration and masks of the frame; None gives neutral colours.
         mirror: whether an unseen point gets the colour of its mirror image if that is seen.
     """
 
-    def __init__(self, frame: FrameResult, prior: ShapePrior, loaded: LoadedFrame | None, mirror: bool = True) -> None:
-        self.frame, self.prior, self.loaded, self.mirror = frame, prior, loaded, mirror
-        self.objects, shapes = frame.refined_cars, frame.shapes
-        self.cars = [
-            EstimatedCar(prior, torch.from_numpy(shapes.codes[o.car]), torch.from_numpy(shapes.T_cam_obj[o.car]))
-            for o in self.objects
-        ]
-        self.view = None
+    def __init__(
+        self, cars: Sequence[DrawnCar], prior: ShapePrior, loaded: LoadedFrame | None, mirror: bool = True
+    ) -> None:
+        self.cars, self.loaded, self.mirror, self.view = cars, loaded, mirror, None
         if loaded is not None:
             masks = _masks_of_lines(loaded)
-            of_cars = [masks.get(one.line.line_number) for one in self.objects]
-            self.view = FrameView(View.of_frame(loaded.frame), self.cars, of_cars)
+            fields = [EstimatedCar(prior, torch.from_numpy(c.code), torch.from_numpy(c.T_cam_obj)) for c in cars]
+            self.view = FrameView(View.of_frame(loaded.frame), fields, [masks.get(car.line) for car in cars])
 
     def mesh(self, index: int, finer: bool = False) -> tuple[trimesh.Trimesh, Paint]:
-        """Surface of `objects[index]` in the left camera frame, and the colours of its vertices.
+        """Surface of `cars[index]` in the left camera frame, and the colours of its vertices.
 
         If `finer`, triangles are divided, without a change of the surface, until colours are as fine as the image.
         """
@@ -128,7 +123,7 @@ class PaintedFrame:
         return mesh, self._paint(index, mesh.vertices, mesh.vertex_normals)
 
     def samples(self, index: int, count: int) -> tuple[Points, Points, Paint]:
-        """Points (count, 3) on the surface of `objects[index]`, normals (count, 3) of their triangles, and colours.
+        """Points (count, 3) on the surface of `cars[index]`, normals (count, 3) of their triangles, and colours.
 
         Points are uniform by area and the same in every call; normals point outwards.
         """
@@ -157,9 +152,9 @@ class PaintedFrame:
         return found
 
     def _mesh(self, index: int) -> trimesh.Trimesh:
-        car = self.cars[index]
-        values = self.prior.values(car.code[None].to(self.prior.origin))[0]
-        return sdf_to_mesh(values, self.prior.origin, self.prior.spacing_m, car.T_cam_obj)
+        surface = self.cars[index].surface
+        assert surface is not None, "the shape of a refined car is known with its prior"
+        return surface
 
     def _paint(self, index: int, points_cam: Points, normals_cam: Points) -> Paint:
         """Colours of points on the surface of a car; see `FrameView.is_seen`."""
@@ -170,7 +165,7 @@ class PaintedFrame:
         paint.rgb[seen] = self.view.colours(points_cam[seen])
         paint.source[seen] = SEEN
         if self.mirror:
-            T_cam_obj = self.cars[index].T_cam_obj.double().numpy()
+            T_cam_obj = self.cars[index].T_cam_obj
             _mirror(paint, (points_cam - T_cam_obj[:3, 3]) @ T_cam_obj[:3, :3])
         return paint
 

@@ -8,18 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from directshape_torch.errors import MissingDependencyError
 from directshape_torch.export.frame_source import Exporter, FrameSource, frame_numbers
 from directshape_torch.export.painted_cars import ground_grid
-from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene.masks import MASK_THRESHOLD
 from directshape_torch.stereo_matching.disparity import rgb8
-from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Colour
+from directshape_torch.visualize.drawing import GREEN, GREY, Colour
 from directshape_torch.visualize.drawn_car import cars_of_result
 from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
 from directshape_torch.visualize.residuals import CarResiduals, photometric_colours, silhouette_colours
@@ -70,11 +68,11 @@ class RerunExporter(Exporter):
         stream.log_mesh("world/ground", ground, GREY)
         stream.at(frame)
         _clear_cars(stream)
-        for index, one in enumerate(source.painted.objects):
+        for index, row in enumerate(source.refined):
             # All frames of a track use one name.
-            track = source.result.shapes.tracks[one.car]
+            track = source.result.shapes.tracks[row]
             surface, paint = source.painted.mesh(index)
-            stream.log_mesh(f"world/cars/{f'track_{track}' if track else one.line.line_number}", surface, paint.rgb)
+            stream.log_mesh(f"world/cars/{f'track_{track}' if track else source.after[row].line}", surface, paint.rgb)
         if refiner is not None:
             self._add_iterations(stream, loaded, refiner, frame)
 
@@ -140,19 +138,12 @@ def _log_images(stream: _Stream, loaded: LoadedFrame) -> None:
 
 def _log_boxes(stream: _Stream, source: FrameSource) -> None:
     """Log the boxes of the input, of the truth, and of the result, with grey for cars that were not refined."""
-    before = source.before or []
-    corners = np.array([car.corners_cam for car in before])
-    stream.log_boxes("world/boxes/before", corners, [ORANGE] * len(before), [f"{car.line}" for car in before])
+    for name, cars in (("before", source.before or []), ("after", source.after)):
+        corners, colours = np.array([car.corners_cam for car in cars]), [car.colour for car in cars]
+        labels = [f"{car.line} {car.status or ''}".rstrip() for car in cars]
+        stream.log_boxes(f"world/boxes/{name}", corners, colours, labels)
     truth = np.array(source.truth_corners_cam)
     stream.log_boxes("world/boxes/truth", truth, [GREEN] * len(truth), ["truth"] * len(truth))
-    cars, t_cam_ref = [one for one in source.result.objects if one.car >= 0], source.t_cam_ref.numpy()
-    T_cam_box = np.tile(np.eye(4), (len(cars), 1, 1))
-    for T, one in zip(T_cam_box, cars, strict=True):
-        T[:3, :3], T[:3, 3] = one.R_ref_obj, one.bottom_ref + t_cam_ref
-    hwl = torch.tensor(np.array([one.hwl for one in cars]).reshape(-1, 3))
-    colours = [BLUE if one.is_refined else GREY for one in cars]
-    labels = [f"{one.line.line_number} {one.status}" for one in cars]
-    stream.log_boxes("world/boxes/after", box_corners(torch.from_numpy(T_cam_box), hwl).numpy(), colours, labels)
 
 
 def _log_state(stream: _Stream, trace: RefinementTrace, number: int, lines: Sequence[int]) -> None:

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.export.frame_source import Exporter, FrameSource, frame_numbers
-from directshape_torch.export.painted_cars import SEEN, Paint, PaintedFrame, ground_grid
+from directshape_torch.export.painted_cars import SEEN, Paint, ground_grid
 from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.files.mesh_files import T_GLTF_CAM
-from directshape_torch.io.run_folder import FrameResult, ResultObject
-from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.visualize.drawing import Array
 
 if TYPE_CHECKING:
     import trimesh
@@ -35,13 +34,12 @@ class GlbExporter(Exporter):
     def add(self, source: FrameSource) -> None:
         # Frames come sequence by sequence, and a car is kept until its sequence is over.
         self._write([key for key in self._moving if not source.frame_id.startswith(_sequence(key[0]))])
-        painted = source.painted
-        write_bytes(self.folder / "glb" / f"{source.frame_id}.glb", frame_glb(painted, source.images))
-        for index, one in enumerate(painted.objects):
-            shapes = painted.frame.shapes
-            key = shapes.tracks[one.car], int(shapes.track_parts[one.car])
+        write_bytes(self.folder / "glb" / f"{source.frame_id}.glb", frame_glb(source))
+        shapes = source.result.shapes
+        for index, row in enumerate(source.refined):
+            key = shapes.tracks[row], int(shapes.track_parts[row])
             if key[0] and key[1] >= 0:
-                self._moving.setdefault(key, _MovingCar()).add(painted, index, _time_s(source))
+                self._moving.setdefault(key, _MovingCar()).add(source, index)
 
     def finish(self) -> None:
         self._write(list(self._moving))
@@ -55,20 +53,20 @@ class GlbExporter(Exporter):
                 write_bytes(self.folder / "glb" / f"{name}.glb", car.glb(_sequence(track)))
 
 
-def frame_glb(painted: PaintedFrame, loaded: LoadedFrame | None) -> bytes:
+def frame_glb(source: FrameSource) -> bytes:
     """All refined cars of a frame, painted, with a 5 m grid if the frame's ground is known.
 
     Nodes rotate the vertices from the left camera frame, metres, to glTF's axes (y up).
     """
     import trimesh
 
-    scene = trimesh.Scene(metadata={"frame_id": painted.frame.frame_id, "vertices": "left camera frame, metres"})
-    for index, one in enumerate(painted.objects):
-        mesh, paint = painted.mesh(index, finer=True)
-        mesh.metadata.update(_extras(one, painted.frame))
-        _add(scene, f"car_{one.line.line_number}", mesh, paint)
-    if loaded is not None:
-        ground = ground_grid(loaded.frame.ground.normal[0], float(loaded.frame.ground.offset[0]))
+    scene = trimesh.Scene(metadata={"frame_id": source.frame_id, "vertices": "left camera frame, metres"})
+    for index, car in enumerate(source.painted.cars):
+        mesh, paint = _mesh(source, index)
+        _add(scene, f"car_{car.line}", mesh, paint)
+    if source.images is not None:
+        plane = source.images.frame.ground
+        ground = ground_grid(plane.normal[0], float(plane.offset[0]))
         grey = np.full((len(ground.vertices), 3), _GREY_OF_GROUND, np.uint8)
         _add(scene, "ground", ground, Paint(grey, np.zeros(len(grey), np.uint8)))
     return _glb(scene)
@@ -90,26 +88,24 @@ class _MovingCar:
     """A `_MovingCar` is a car in several frames, with the surface and colours of its nearest view."""
 
     def __init__(self) -> None:
-        self.T_cam_obj: dict[str, NDArray[np.float64]] = {}
+        self.T_cam_obj: dict[str, Array] = {}
         self.time_s: list[float] = []
         self._depth_m = np.inf
 
-    def add(self, painted: PaintedFrame, index: int, time_s: float) -> None:
-        T_cam_obj = painted.cars[index].T_cam_obj.double().numpy()
-        self.T_cam_obj[painted.frame.frame_id] = T_cam_obj
-        self.time_s.append(time_s)
+    def add(self, source: FrameSource, index: int) -> None:
+        T_cam_obj = source.painted.cars[index].T_cam_obj
+        self.T_cam_obj[source.frame_id] = T_cam_obj
+        self.time_s.append(_time_s(source))
         if T_cam_obj[2, 3] < self._depth_m:
-            self._depth_m, self._nearest = float(T_cam_obj[2, 3]), (painted, index)
+            self._depth_m, self._nearest = float(T_cam_obj[2, 3]), (source, index)
 
     def glb(self, sequence: str) -> bytes:
         """A scene with a car at the origin of a node that moves in the left camera frame, below a node with y up."""
         import trimesh
 
-        painted, index = self._nearest
-        one, frame = painted.objects[index], painted.frame
-        mesh, paint = painted.mesh(index, finer=True)
-        mesh.apply_transform(np.linalg.inv(self.T_cam_obj[frame.frame_id]))
-        mesh.metadata.update(_extras(one, frame))
+        source, index = self._nearest
+        mesh, paint = _mesh(source, index)
+        mesh.apply_transform(np.linalg.inv(self.T_cam_obj[source.frame_id]))
         scene = trimesh.Scene(metadata={"frame_ids": list(self.T_cam_obj), "vertices": "object frame, metres"})
         place: Callable[..., None] = scene.graph.update
         place(frame_to=_CAMERA, matrix=T_GLTF_CAM)
@@ -126,7 +122,7 @@ def _animate(
     buffers: MutableMapping[str, bytes],
     tree: dict[str, Any],
     seconds: NDArray[np.float64],  # (F,) rising
-    T_cam_obj: NDArray[np.float64],  # (F, 4, 4)
+    T_cam_obj: Array,  # (F, 4, 4)
 ) -> None:
     """Animate the car's node; trimesh writes no animations itself, but calls this with its buffers and tree."""
     from scipy.spatial.transform import Rotation
@@ -144,7 +140,7 @@ def _animate(
         tree["animations"][0]["channels"].append({"sampler": number, "target": {"node": node, "path": name}})
 
 
-def _accessor(buffers: MutableMapping[str, bytes], tree: dict[str, Any], name: str, values: NDArray[np.float64]) -> int:
+def _accessor(buffers: MutableMapping[str, bytes], tree: dict[str, Any], name: str, values: Array) -> int:
     """The index of a new accessor for the values."""
     buffers[name] = values.astype("<f4").tobytes()
     of = {"bufferView": len(buffers) - 1, "componentType": _FLOAT, "count": len(values)}
@@ -153,16 +149,18 @@ def _accessor(buffers: MutableMapping[str, bytes], tree: dict[str, Any], name: s
     return len(tree["accessors"]) - 1
 
 
-def _extras(one: ResultObject, frame: FrameResult) -> dict[str, Any]:
-    """Values of a car for `extras`."""
-    return {
-        "frame_id": frame.frame_id,
-        "line": one.line.line_number,
-        "type": one.line.type,
-        "status": one.status,
-        "dimensions_hwl_m": one.hwl.tolist(),
-        "probability_better": float(frame.shapes.probabilities_better[one.car]),
+def _mesh(source: FrameSource, index: int) -> tuple[trimesh.Trimesh, Paint]:
+    """Surface and colours of a refined car; what is known of the car becomes the `extras` of the mesh."""
+    (mesh, paint), row, shapes = source.painted.mesh(index, finer=True), source.refined[index], source.result.shapes
+    mesh.metadata |= {
+        "frame_id": source.frame_id,
+        "line": source.after[row].line,
+        "type": source.result.cars[row].type,
+        "status": source.after[row].status,
+        "dimensions_hwl_m": shapes.boxes_hwl[row].tolist(),
+        "probability_better": float(shapes.probabilities_better[row]),
     }
+    return mesh, paint
 
 
 def _srgb_to_linear(rgb: NDArray[np.uint8]) -> NDArray[np.uint16]:
@@ -208,8 +206,8 @@ class PlyExporter(Exporter):
     """A `PlyExporter` writes `ply/NNNNNN_LINE.ply`: surfaces with normals, sRGB and `color_source` (see `Paint`)."""
 
     def add(self, source: FrameSource) -> None:
-        for index, one in enumerate(source.painted.objects):
-            path = self.folder / "ply" / f"{source.frame_id}_{one.line.line_number}.ply"
+        for index, car in enumerate(source.painted.cars):
+            path = self.folder / "ply" / f"{source.frame_id}_{car.line}.ply"
             write_bytes(path, _ply(*source.painted.mesh(index)))
 
 
@@ -220,13 +218,13 @@ class PointsExporter(Exporter):
         import trimesh
 
         painted, measured = source.painted, source.painted.stereo_points()
-        for index, one in enumerate(painted.objects):
-            stem = self.folder / "points" / f"{source.frame_id}_{one.line.line_number}"
+        for index, car in enumerate(painted.cars):
+            stem = self.folder / "points" / f"{source.frame_id}_{car.line}"
             points_cam, normals_cam, paint = painted.samples(index, self.options.points_per_car)
             spread = trimesh.Trimesh(points_cam, vertex_normals=normals_cam, process=False)
             write_bytes(f"{stem}.ply", _ply(spread, paint))
-            if one.line.line_number in measured:
-                points_cam, rgb = measured[one.line.line_number]
+            if car.line in measured:
+                points_cam, rgb = measured[car.line]
                 paint = Paint(rgb, np.full(len(rgb), SEEN, np.uint8))
                 write_bytes(f"{stem}_stereo.ply", _ply(trimesh.Trimesh(points_cam, process=False), paint, False))
 

@@ -15,24 +15,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import ConfigError, DataFormatError
 from directshape_torch.files.find_files import is_frame_id
 from directshape_torch.files.read_files import parse_json, read_bytes
 from directshape_torch.files.schema import record_of
-from directshape_torch.geometry.box3d import rotation_about_y
 from directshape_torch.io.config_files import config_from_mapping
 from directshape_torch.io.frame_layout import frames_among
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.result_files import ShapeArrays, read_shapes
 from directshape_torch.io.run_manifest import FrameEntry, hash_bytes, read_manifest
 from directshape_torch.status import Status
-
-COPIED = "copied"
-"""This is the status of lines of other classes, which a refinement does not change."""
 
 _AGAIN = "refine the frame again"
 # The summary names cars whose probability to be not worse is below `_SURE`, at most `_MOST_DOUBTFUL` of a frame.
@@ -160,29 +154,6 @@ def _expected(shapes: ShapeArrays) -> tuple[float, float, dict[str, list[float]]
 
 
 @dataclass(frozen=True)
-class ResultObject:
-    """A `ResultObject` is one result line with a 3D box, refined or not."""
-
-    line: KittiObject  # type, 2D box, score and the other columns of the detector
-    status: str  # name of the `Status` of a car, or "copied"
-    car: int  # row in the frame's `ShapeArrays`, -1 for lines without one
-    # (3, 3) axes of the object (forward, down, left) in `ref`; a refined car includes its tilt.
-    R_ref_obj: NDArray[np.float64]
-    bottom_ref: NDArray[np.float64]  # (3,) bottom centre of the box in `ref`, metres
-    hwl: NDArray[np.float64]  # (3,) height, width, length, metres
-
-    @property
-    def is_refined(self) -> bool:
-        """Whether box and shape come from a refinement."""
-        return self.status != COPIED and Status[self.status].is_refined
-
-    @property
-    def centre_ref(self) -> NDArray[np.float64]:
-        """The centre (3,) of the box in `ref`, metres, half its height above the bottom centre."""
-        return np.asarray(self.bottom_ref - 0.5 * self.hwl[0] * self.R_ref_obj[:, 1])
-
-
-@dataclass(frozen=True)
 class FrameResult:
     """A `FrameResult` has the results of a run for one frame."""
 
@@ -197,18 +168,6 @@ class FrameResult:
         """The result line of each car."""
         by_number = {line.line_number: line for line in self.lines}
         return [by_number[number] for number in self.shapes.input_lines.tolist()]
-
-    @property
-    def objects(self) -> tuple[ResultObject, ...]:
-        """The lines that have a 3D box, in their order."""
-        car_of_line = {number: car for car, number in enumerate(self.shapes.input_lines.tolist())}
-        boxes = [line for line in self.lines if line.has_box_3d]
-        return tuple(_object(line, car_of_line.get(line.line_number, -1), self.shapes) for line in boxes)
-
-    @property
-    def refined_cars(self) -> tuple[ResultObject, ...]:
-        """The objects that have a refined shape."""
-        return tuple(one for one in self.objects if one.is_refined)
 
 
 class RunFolder:
@@ -272,24 +231,3 @@ def done_frames(out_dir: Path) -> list[str]:
     texts = {path.stem for path in (out_dir / "data").glob("*.txt")}
     stems = (path.stem for path in (out_dir / "shapes").glob("*.npz"))
     return sorted(stem for stem in stems if stem in texts and is_frame_id(stem))
-
-
-def _object(line: KittiObject, car: int, shapes: ShapeArrays) -> ResultObject:
-    if car < 0:
-        R_ref_obj = rotation_about_y(torch.tensor(line.rotation_y, dtype=torch.float64)).numpy()
-        return ResultObject(line, COPIED, car, R_ref_obj, np.array(line.location_ref), np.array(line.hwl))
-    return ResultObject(
-        line=line,
-        status=shapes.statuses[car],
-        car=car,
-        R_ref_obj=_nearest_rotation(shapes.T_ref_obj[car, :3, :3]),
-        bottom_ref=shapes.boxes_location_ref[car].astype(np.float64),
-        hwl=shapes.boxes_hwl[car].astype(np.float64),
-    )
-
-
-def _nearest_rotation(R: NDArray[Any]) -> NDArray[np.float64]:
-    """The rotation nearest to a float32 one, exact to the digits that other programs check."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_matrix(R.astype(np.float64)).as_matrix())

@@ -50,7 +50,7 @@ def test_views_of_a_track_share_a_shape_and_get_a_file(shared_kitti: Path, seque
     assert np.isfinite(track.code_covariance).all()
     # Lines are those of the frame, not of the sequence's file.
     run = RunFolder(tmp_path)
-    assert [len(run.read(frame_id).refined_cars) for frame_id in run.frame_ids] == [2] * len(FRAMES)
+    assert [len(run.read(frame_id).cars) for frame_id in run.frame_ids] == [2] * len(FRAMES)
 
 
 def test_split_tracks_are_named(

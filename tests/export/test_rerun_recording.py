@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import DataFormatError, MissingDependencyError
 from directshape_torch.export.export_run import export_run
-from directshape_torch.export.frame_source import ExportOptions
-from directshape_torch.export.painted_cars import SEEN, PaintedFrame
+from directshape_torch.export.frame_source import ExportOptions, FrameSource
+from directshape_torch.export.painted_cars import SEEN
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.config_files import config_from_mapping
 from directshape_torch.io.kitti_labels import read_objects
@@ -154,9 +154,9 @@ def test_boxes_are_those_of_the_files(finished: FinishedRun, recording: Recordin
     truth = corners_of_lines(finished, finished.root / "training" / "label_2" / name)
     np.testing.assert_allclose(recording.corners("/world/boxes/truth", place), truth, atol=2e-5)
     arrays = finished.state(f"{frame:06d}")
-    T = torch.from_numpy(arrays["T_cam_obj"].astype(np.float64))
-    T[:, :3, 3] = torch.from_numpy(arrays["boxes_location_ref"].astype(np.float64)) + t_cam_ref(finished)
-    after = box_corners(T, torch.from_numpy(arrays["boxes_hwl"].astype(np.float64))).numpy()
+    names = ("location_ref", "rotation_y", "hwl")
+    location, yaw, hwl = (torch.from_numpy(arrays[f"boxes_{name}"]).double() for name in names)
+    after = box_corners(pose_from_kitti(location + t_cam_ref(finished), yaw), hwl).numpy()
     np.testing.assert_allclose(
         recording.corners("/world/boxes/after", place), np.stack([by_place(box) for box in after]), atol=2e-5
     )
@@ -167,11 +167,10 @@ def test_boxes_are_those_of_the_files(finished: FinishedRun, recording: Recordin
 def test_frames_show_the_refined_surfaces_with_the_colours_of_the_image(
     finished: FinishedRun, recording: Recording
 ) -> None:
-    inputs = finished.inputs()
-    painted = PaintedFrame(finished.folder().read("000001"), finished.prior, inputs.dataset.load("000001"))  # type: ignore[union-attr]
-    for index, one in enumerate(painted.objects):
+    painted = FrameSource(finished.inputs(), "000001", ExportOptions()).painted
+    for index, car in enumerate(painted.cars):
         mesh, paint = painted.mesh(index)
-        entity = f"/world/cars/{one.line.line_number}"
+        entity = f"/world/cars/{car.line}"
         np.testing.assert_allclose(recording.at(entity, "vertex_positions", 1), mesh.vertices, atol=1e-5)
         np.testing.assert_array_equal(recording.at(entity, "triangle_indices", 1), mesh.faces)
         packed = np.array(recording.at(entity, "vertex_colors", 1), dtype=np.uint32)
