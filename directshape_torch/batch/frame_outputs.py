@@ -64,11 +64,9 @@ def write_frame_outputs(
     files = [result_path(out_dir, loaded.frame_id)]
     if options.meshes is not None:
         files += write_meshes(out_dir, loaded.frame_id, loaded.detected_objects, result, options.meshes)
-    if options.overlays:
-        from directshape_torch.visualize.overlay import overlay_of_frame
-
+    if options.draw is not None:
         files.append(overlay_path(out_dir, loaded.frame_id))
-        write_png(files[-1], overlay_of_frame(loaded, result))
+        write_png(files[-1], options.draw(loaded, result))
     boxes = result.boxes()
     shapes = _shape_arrays(loaded, result, boxes, prior_sha256)
     write_result_text(files[0], loaded.input_objects, refined_boxes(boxes, result.refined, loaded.row_of_detection))

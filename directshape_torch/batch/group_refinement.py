@@ -14,11 +14,11 @@ import torch
 from directshape_torch.batch.frame_groups import FrameGroup
 from directshape_torch.batch.frame_outputs import failed_entry, write_frame_outputs
 from directshape_torch.batch.options import RefineOptions
-from directshape_torch.batch.run_log import OutputLostError, writing_to
 from directshape_torch.batch.run_summary import RunTimings, peak_device_memory_mb, peak_memory_mb
 from directshape_torch.compile import cars_ahead
 from directshape_torch.errors import CompilationError, DirectShapeError, MissingDependencyError
 from directshape_torch.io.frame_collation import collate, split_by_rig
+from directshape_torch.io.run_log import OutputLostError, writing_to
 from directshape_torch.io.run_manifest import FrameEntry, hash_files
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refinement.result import RefinementResult

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import numpy as np
+from numpy.typing import NDArray
+
 from directshape_torch.errors import InputError
+from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.refinement.result import RefinementResult
 
 MeshFormat = Literal["ply", "glb"]
 
@@ -17,7 +22,8 @@ class RefineOptions:
 
     Attributes:
         meshes: format of the surface of each refined car, "ply" or "glb"; None writes none.
-        overlays: whether to write a picture of each frame, before and after.
+        draw: function that draws the overlay of each frame (`visualize.overlay.overlay_of_frame`); None writes none.
+            Workers import it by its name.
         batch_frames: number of frames refined together in one call.
         workers: number of parallel processes. None: only this process.
         threads: number of threads of each process. None: this process keeps its number, and a worker gets 1.
@@ -27,14 +33,14 @@ class RefineOptions:
         InputError: an unknown mesh format, or a number that is too small.
 
     Examples:
-        >>> RefineOptions(meshes="ply", overlays=True).outputs
-        ('data', 'shapes', 'meshes_ply', 'overlays')
+        >>> RefineOptions(meshes="ply").outputs
+        ('data', 'shapes', 'meshes_ply')
         >>> RefineOptions(workers=4).threads_per_worker
         1
     """
 
     meshes: MeshFormat | None = None
-    overlays: bool = False
+    draw: Callable[[LoadedFrame, RefinementResult], NDArray[np.uint8]] | None = None
     batch_frames: int = 1
     workers: int | None = None
     threads: int | None = None
@@ -52,7 +58,7 @@ class RefineOptions:
     def outputs(self) -> tuple[str, ...]:
         """Names of the kinds of files that each frame gets."""
         meshes = () if self.meshes is None else (f"meshes_{self.meshes}",)
-        return ("data", "shapes", *meshes, *(("overlays",) if self.overlays else ()))
+        return ("data", "shapes", *meshes, *(() if self.draw is None else ("overlays",)))
 
     @property
     def threads_per_worker(self) -> int | None:

@@ -16,7 +16,6 @@ from directshape_torch.batch.frame_outputs import failed_entry
 from directshape_torch.batch.group_refinement import GroupReport, RunJob, limited_threads, refine_group
 from directshape_torch.batch.options import RefineOptions, RunObserver
 from directshape_torch.batch.resumption import OUTPUT_FOLDERS, EarlierResults, remove_results, remove_unfinished_files
-from directshape_torch.batch.run_log import RunBeginning, RunEvent, RunLog, digit_warnings, read_log
 from directshape_torch.batch.run_summary import RunSummary, RunTimings, find_warnings, write_timings
 from directshape_torch.batch.workers import LocalWorkers, reports_of
 from directshape_torch.errors import DirectShapeError, InputError
@@ -24,6 +23,7 @@ from directshape_torch.files.atomic_files import check_folder
 from directshape_torch.io.config_files import config_to_mapping
 from directshape_torch.io.result_files import read_shapes, write_tracks
 from directshape_torch.io.run_folder import done_frames, overlay_path, result_path, shapes_path
+from directshape_torch.io.run_log import RunBeginning, RunEvent, RunLog, digit_warnings, read_log
 from directshape_torch.io.run_manifest import RunManifest, SharedHashes, hash_fields, hash_prior
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.refinement.scene_problem import TermFactory
@@ -161,7 +161,7 @@ class _Run:
 
     def _look_for_files(self) -> None:
         """Mark frames without files as failed, since every frame must have ended."""
-        paths = [result_path, shapes_path, *([overlay_path] if self.options.overlays else [])]
+        paths = [result_path, shapes_path, *([] if self.options.draw is None else [overlay_path])]
         failed = self.earlier.manifest.failed
         for frame_id in self.dataset.frame_ids:
             if frame_id not in failed and not all(path(self.out_dir, frame_id).is_file() for path in paths):

@@ -21,12 +21,13 @@ from directshape_torch.cli.progress import ProgressBar
 from directshape_torch.evaluation.matching import match_to_labels
 from directshape_torch.evaluation.pose_error import CarErrors, errors_of
 from directshape_torch.evaluation.tables import align
-from directshape_torch.export.frame_source import ExportOptions, FrameSource
-from directshape_torch.export.surface_files import frame_glb
 from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.io.run_folder import FrameResult, RunFolder
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset, open_dataset
+from directshape_torch.visualize.frame_source import ExportOptions, FrameSource
+from directshape_torch.visualize.overlay import overlay_of_frame
 from directshape_torch.visualize.run_frames import RunInputs
+from directshape_torch.visualize.surface_files import frame_glb
 
 DEMO_FOLDER = Path(__file__).parent.parent / "assets" / "demo"
 
@@ -58,7 +59,9 @@ def run(args: argparse.Namespace) -> int:
     refiner = make_refiner(args.config, [], "pca", args.device)
     # If other programs share the cores, several threads wait for each other, which makes one frame take minutes.
     with ProgressBar() as progress, limited_threads(1):
-        summary = refine_dataset(dataset, refiner, args.out, RefineOptions(overlays=True), progress, fresh=args.fresh)
+        summary = refine_dataset(
+            dataset, refiner, args.out, RefineOptions(draw=overlay_of_frame), progress, fresh=args.fresh
+        )
         (frame_id,) = dataset.frame_ids
         frame = FrameSource(RunInputs(RunFolder(args.out), refiner.prior, dataset), frame_id, ExportOptions())
         write_bytes(args.out / "scene.glb", frame_glb(frame))

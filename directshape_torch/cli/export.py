@@ -14,12 +14,12 @@ from pathlib import Path
 from directshape_torch.cli.options import add_run_inputs, inputs_of_run, mask_source
 from directshape_torch.cli.progress import Bar
 from directshape_torch.errors import InputError
-from directshape_torch.export.export_run import FORMATS, export_run
-from directshape_torch.export.frame_source import ExportOptions
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.rig_file import known_rigs
 from directshape_torch.rig.rigs import RigEstimates
+from directshape_torch.visualize.export_run import FORMATS, export_run
+from directshape_torch.visualize.frame_source import ExportOptions
 from directshape_torch.visualize.run_frames import RunInputs
 
 

@@ -19,7 +19,6 @@ from directshape_torch.batch.learn_detector import learn_detector
 from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.batch.refine_dataset import check_out_dir, refine_dataset
 from directshape_torch.batch.run_summary import format_summary
-from directshape_torch.batch.verdict import verdict
 from directshape_torch.cli.options import (
     add_data_options,
     add_device_option,
@@ -42,7 +41,9 @@ from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, known_rigs, lo
 from directshape_torch.rig.rigs import RigEstimates
 from directshape_torch.scene_check.finding import SAID_BY_THE_RUN, by_severity
 from directshape_torch.terms.lidar import LidarPoints
+from directshape_torch.visualize.overlay import overlay_of_frame
 from directshape_torch.visualize.rig_picture import draw_rigs
+from directshape_torch.visualize.verdict import verdict
 
 # This number of frames distinguishes a mistake from the noise of a detector.
 _CHECKED_FRAMES = 3
@@ -102,7 +103,8 @@ def run(args: argparse.Namespace) -> int:
     """Refine the data set, write the results and report."""
     default_frames = _TRACK_FRAMES if args.tracks else 1
     batch_frames = default_frames if args.batch_frames is None else args.batch_frames
-    options = RefineOptions(args.meshes, args.overlays, batch_frames, args.workers, args.threads, args.retries)
+    draw = overlay_of_frame if args.overlays else None
+    options = RefineOptions(args.meshes, draw, batch_frames, args.workers, args.threads, args.retries)
     extra = [] if args.lidar is None else [LidarPoints()]
     exact = ["rig.disparity_sigma_px=0"] if args.rig == "none" else []
     settings = [*exact, *args.set]

@@ -15,7 +15,7 @@ from pathlib import Path
 from directshape_torch.cli.options import add_run_inputs, inputs_of_run
 from directshape_torch.cli.progress import Bar
 from directshape_torch.io.run_folder import RunFolder
-from directshape_torch.report.make_report import make_report
+from directshape_torch.visualize.make_report import make_report
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -11,7 +11,7 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from directshape_torch.batch.run_status import format_status, read_status
+from directshape_torch.io.run_status import format_status, read_status
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -24,7 +24,7 @@ def record_of(path: Path | str, cls: type[_RecordT], content: Any, cure: str = "
         where: place in the file, before the name of a field, such as "objects[0].".
 
     Examples:
-        >>> from directshape_torch.batch.run_log import RunEvent
+        >>> from directshape_torch.io.run_log import RunEvent
         >>> record_of("a.json", RunEvent, {"frame": "000107", "at": 0.5}).frame
         '000107'
         >>> record_of("a.json", RunEvent, {"frame": 107, "at": 0.5})

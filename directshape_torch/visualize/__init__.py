@@ -1,1 +1,1 @@
-"""This package draws pictures of results, pixels, shape priors and disparity fields."""
+"""This package has what people look at: pictures, pages about runs, recordings, and files for other programs."""

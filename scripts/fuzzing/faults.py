@@ -15,8 +15,8 @@ from unittest import mock
 from helpers.output_folders import result_files
 
 from directshape_torch.batch.options import RunObserver
-from directshape_torch.batch.run_log import log_path, read_log
 from directshape_torch.errors import DirectShapeError
+from directshape_torch.io.run_log import log_path, read_log
 from fuzzing.runs import DisturbedRuns, disturbed_runs
 
 FRAMES = ("000000", "000001", "000002")

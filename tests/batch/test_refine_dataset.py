@@ -24,6 +24,7 @@ from directshape_torch.io.result_files import read_shapes
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.visualize.overlay import overlay_of_frame
 
 
 def test_cars_come_nearer_to_the_truth(shared_kitti: Path, tmp_path: Path) -> None:
@@ -52,7 +53,7 @@ def test_cars_come_nearer_to_the_truth(shared_kitti: Path, tmp_path: Path) -> No
 def out(shared_kitti: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with all optional outputs."""
     out = tmp_path_factory.mktemp("out")
-    refine(shared_kitti, out, meshes="ply", overlays=True)
+    refine(shared_kitti, out, meshes="ply", draw=overlay_of_frame)
     return out
 
 
@@ -86,7 +87,7 @@ def test_shapes_hold_states_of_the_refined_lines(out: Path) -> None:
 
 
 def test_equal_runs_write_equal_bytes(shared_kitti: Path, out: Path, tmp_path: Path) -> None:
-    refine(shared_kitti, tmp_path, meshes="ply", overlays=True)
+    refine(shared_kitti, tmp_path, meshes="ply", draw=overlay_of_frame)
     first = result_files(tmp_path)
     assert first == result_files(out)
     names = ("data/000000.txt", "shapes/000000.npz", "meshes/000000_3.ply", "overlays/000000.png", "summary.json")
@@ -114,7 +115,7 @@ def test_detections_are_not_overwritten(kitti_copy: Path) -> None:
 def test_a_frame_without_cars_is_copied(kitti_copy: Path, tmp_path: Path, content: str) -> None:
     for frame_id in FRAMES:
         (kitti_copy / "detections" / "data" / f"{frame_id}.txt").write_text(content)
-    summary = refine(kitti_copy, tmp_path, meshes="glb", overlays=True)
+    summary = refine(kitti_copy, tmp_path, meshes="glb", draw=overlay_of_frame)
     assert summary.exit_code == 0
     assert summary.num_cars == 0
     assert (tmp_path / "data" / "000000.txt").read_text() == content

@@ -15,6 +15,7 @@ from directshape_torch.io.config_files import load_config
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.visualize.overlay import overlay_of_frame
 
 
 def test_a_second_run_does_nothing(shared_kitti: Path, tmp_path: Path) -> None:
@@ -31,18 +32,18 @@ def test_a_second_run_does_nothing(shared_kitti: Path, tmp_path: Path) -> None:
 def test_further_outputs_are_added_to_finished_frames(shared_kitti: Path, tmp_path: Path) -> None:
     refine(shared_kitti, tmp_path)
     results = result_files(tmp_path / "data")
-    assert refine(shared_kitti, tmp_path, overlays=True).resumed == ()
+    assert refine(shared_kitti, tmp_path, draw=overlay_of_frame).resumed == ()
     assert (tmp_path / "overlays" / "000000.png").is_file()
     assert result_files(tmp_path / "data") == results
     assert refine(shared_kitti, tmp_path).resumed == FRAMES
 
 
 def test_outputs_that_were_removed_are_made_again(shared_kitti: Path, tmp_path: Path) -> None:
-    refine(shared_kitti, tmp_path, overlays=True, meshes="ply")
+    refine(shared_kitti, tmp_path, draw=overlay_of_frame, meshes="ply")
     before = result_files(tmp_path)
     for name in ("data/000001.txt", "shapes/000001.npz", "overlays/000001.png", "meshes/000001_1.ply"):
         (tmp_path / name).unlink()
-        assert refine(shared_kitti, tmp_path, overlays=True, meshes="ply").resumed == ("000000", "000002")
+        assert refine(shared_kitti, tmp_path, draw=overlay_of_frame, meshes="ply").resumed == ("000000", "000002")
         assert result_files(tmp_path) == before
 
 

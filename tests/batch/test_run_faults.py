@@ -24,10 +24,10 @@ from helpers.output_folders import result_files
 import directshape_torch
 from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
-from directshape_torch.batch.run_log import RunLog, log_path
-from directshape_torch.batch.run_status import read_status
 from directshape_torch.errors import DirectShapeError, RunInProgressError
 from directshape_torch.io.run_folder import done_frames
+from directshape_torch.io.run_log import RunLog, log_path
+from directshape_torch.io.run_status import read_status
 
 refine = partial(quick_runs.refine, threads=1)
 FRAMES = tuple(f"{number:06d}" for number in range(6))

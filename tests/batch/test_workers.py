@@ -18,10 +18,10 @@ from helpers.output_folders import result_files
 from directshape_torch.batch.frame_groups import FrameGroup, frame_groups
 from directshape_torch.batch.group_refinement import GroupReport
 from directshape_torch.batch.options import RunObserver
-from directshape_torch.batch.run_status import read_status
 from directshape_torch.batch.workers import reports_of
 from directshape_torch.errors import DirectShapeError
 from directshape_torch.io.run_manifest import FrameEntry
+from directshape_torch.io.run_status import read_status
 
 DONE: FrameEntry = {"state": "done"}
 

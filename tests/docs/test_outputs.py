@@ -9,8 +9,8 @@ from pathlib import Path
 from helpers.finished_run import FinishedRun
 
 from directshape_torch.cli.inspect import _FIGURES
-from directshape_torch.export.export_run import FORMATS
-from directshape_torch.export.painted_cars import NEUTRAL_RGB
+from directshape_torch.visualize.export_run import FORMATS
+from directshape_torch.visualize.painted_cars import NEUTRAL_RGB
 from directshape_torch.visualize.refinement_trace import RefinementTrace
 
 DOCS = Path(__file__).parents[2] / "docs"

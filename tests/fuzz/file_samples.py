@@ -22,7 +22,6 @@ from helpers.shape_arrays import shape_arrays
 from helpers.synthetic_scene import cached_street
 
 from directshape_torch import load_config
-from directshape_torch.batch.run_status import format_status, read_status
 from directshape_torch.cli.fit_shape import read_boxes
 from directshape_torch.errors import MeshError
 from directshape_torch.files.mesh_files import MESH_SUFFIXES, read_mesh
@@ -35,13 +34,15 @@ from directshape_torch.io.mask_files import CocoFileMasks, InstancePngMasks
 from directshape_torch.io.motion_files import read_poses, read_times
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.io.run_status import format_status, read_status
 from directshape_torch.io.stereo_dataset import LayoutName, open_dataset
 from directshape_torch.io.velodyne import read_points, read_scan
-from directshape_torch.report.make_report import make_report
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.rig_file import load_field, load_rigs, save_field, save_rigs
 from directshape_torch.shape.load_prior import BUNDLED_PRIORS, load_prior
 from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
+from directshape_torch.visualize.make_report import make_report
+from directshape_torch.visualize.overlay import overlay_of_frame
 from directshape_torch.visualize.run_frames import RunInputs
 
 ASSETS = Path(load_prior.__code__.co_filename).parents[1] / "assets"
@@ -190,13 +191,13 @@ def _frames(root: Path, folder: Path) -> dict[str, Sample]:
 
 def _runs(root: Path, out: Path) -> dict[str, Sample]:
     """Files of a run, with the readers that resume or use them."""
-    refine(root, out, overlays=True)
+    refine(root, out, draw=overlay_of_frame)
 
     def report() -> object:
         return make_report(RunInputs(RunFolder(out), load_prior(root / "prior.safetensors")), out.parent / "page.html")
 
     def resumed() -> object:
-        return refine(root, out, overlays=True)
+        return refine(root, out, draw=overlay_of_frame)
 
     return {
         "summary": Sample(out / "summary.json", resumed),

@@ -11,9 +11,9 @@ import pytest
 from helpers.quick_runs import dataset, refine, refiner
 
 from directshape_torch.batch.refine_dataset import refine_dataset
-from directshape_torch.batch.run_log import RunLog, log_path
 from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
 from directshape_torch.io.instance_masks import InstanceMask, within_memory
+from directshape_torch.io.run_log import RunLog, log_path
 from directshape_torch.visualize.drawing import draw_text
 
 

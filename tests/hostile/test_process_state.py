@@ -29,6 +29,7 @@ from directshape_torch.cli.main import main
 from directshape_torch.errors import DirectShapeError
 from directshape_torch.files.atomic_files import write_json
 from directshape_torch.shape.load_prior import load_prior
+from directshape_torch.visualize.overlay import overlay_of_frame
 
 
 def state() -> dict[str, Any]:
@@ -63,7 +64,7 @@ def forward(_: Path, __: Path) -> None:
 
 
 def run(root: Path, out: Path) -> None:
-    options = RefineOptions("ply", overlays=True, threads=2)
+    options = RefineOptions("ply", draw=overlay_of_frame, threads=2)
     one = dataset(root, frames=["000000"])
     refine_dataset(one, refiner(root), out / "out", options)
 

@@ -22,10 +22,10 @@ from helpers.output_folders import result_files
 
 import directshape_torch
 from directshape_torch.batch.options import RunObserver
-from directshape_torch.batch.run_status import read_status
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder, done_frames
+from directshape_torch.io.run_status import read_status
 
 refine = partial(quick_runs.refine, threads=1)
 

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from directshape_torch.batch.run_log import read_log
 from directshape_torch.errors import DataFormatError
+from directshape_torch.io.run_log import read_log
 
 # The rate is measured over this many frames: enough for a mean, few enough to follow a change of load.
 _RECENT_FRAMES = 200

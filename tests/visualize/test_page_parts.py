@@ -14,9 +14,9 @@ from helpers.finished_run import unpacked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from directshape_torch.report.page_parts import data_block, mesh_data, packed, page_frame
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.visualize.drawn_car import mean_car
+from directshape_torch.visualize.page_parts import data_block, mesh_data, packed, page_frame
 
 THREE = files("directshape_torch") / "assets" / "vendor" / "three"
 HOSTILE = '"><script>boom()</script><!-- {{data}} {{style}} \\u2028 </title>'

@@ -18,9 +18,9 @@ from directshape_torch.files.atomic_files import write_png
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import read_record, summary_path
 from directshape_torch.io.run_manifest import hash_fields, write_manifest
-from directshape_torch.report.make_report import make_report
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, save_rigs
+from directshape_torch.visualize.make_report import make_report
 
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome

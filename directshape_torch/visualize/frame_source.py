@@ -8,10 +8,10 @@ from functools import cached_property
 from pathlib import Path
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.export.painted_cars import PaintedFrame
 from directshape_torch.io.run_folder import result_path
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.visualize.painted_cars import PaintedFrame
 from directshape_torch.visualize.run_frames import RunFrame, RunInputs
 
 

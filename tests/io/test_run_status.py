@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from directshape_torch.batch.run_log import RunBeginning, RunLog, log_path
-from directshape_torch.batch.run_status import format_status, read_status
 from directshape_torch.cli.main import main
+from directshape_torch.io.run_log import RunBeginning, RunLog, log_path
+from directshape_torch.io.run_status import format_status, read_status
 
 WORK = {"where": "processes", "workers": 3, "threads": 1, "batch_frames": 2, "device": "cpu"}
 TODO = tuple(f"{number:06d}" for number in range(10, 20))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from directshape_torch.export.frame_source import Exporter, FrameSource
 from directshape_torch.files.atomic_files import write_bytes, write_json
 from directshape_torch.files.read_files import read_bytes
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.run_folder import FrameResult, result_path
+from directshape_torch.visualize.frame_source import Exporter, FrameSource
 
 _KITTI_FRAME = "ref: KITTI's rectified camera 0, x right, y down, z forward, metres and radians"
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.finished_run import FRAMES, FinishedRun
 
-from directshape_torch.export.export_run import export_run
+from directshape_torch.visualize.export_run import export_run
 
 
 @pytest.fixture(scope="module")

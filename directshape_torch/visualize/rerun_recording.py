@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import MissingDependencyError
-from directshape_torch.export.frame_source import Exporter, FrameSource, frame_numbers
-from directshape_torch.export.painted_cars import ground_grid
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene.masks import MASK_THRESHOLD
 from directshape_torch.stereo_matching.disparity import rgb8
 from directshape_torch.visualize.drawing import GREEN, GREY, Colour
 from directshape_torch.visualize.drawn_car import cars_of_result
+from directshape_torch.visualize.frame_source import Exporter, FrameSource, frame_numbers
+from directshape_torch.visualize.painted_cars import ground_grid
 from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
 from directshape_torch.visualize.residuals import CarResiduals, photometric_colours, silhouette_colours
 

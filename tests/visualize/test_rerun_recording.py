@@ -19,15 +19,15 @@ from scipy.spatial.transform import Rotation
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import DataFormatError, MissingDependencyError
-from directshape_torch.export.export_run import export_run
-from directshape_torch.export.frame_source import ExportOptions, FrameSource
-from directshape_torch.export.painted_cars import SEEN
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.config_files import config_from_mapping
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.visualize.export_run import export_run
+from directshape_torch.visualize.frame_source import ExportOptions, FrameSource
+from directshape_torch.visualize.painted_cars import SEEN
 
 pytest.importorskip("rerun", reason="the extra `viewer` is not installed")
 

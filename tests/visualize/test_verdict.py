@@ -9,8 +9,8 @@ import pytest
 from helpers.rig_rows import estimate
 from helpers.shape_arrays import shape_arrays
 
-from directshape_torch.batch.verdict import verdict
 from directshape_torch.io.run_folder import FrameRecord, frame_entry
+from directshape_torch.visualize.verdict import verdict
 
 
 def frames(**changes: Any) -> dict[str, Any]:

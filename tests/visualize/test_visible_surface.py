@@ -11,10 +11,10 @@ from helpers.ellipsoids import CENTRE_OBJ, HALF_AXES, ellipsoid_prior
 from numpy.typing import NDArray
 
 from directshape_torch.evaluation.shape_error import EstimatedCar
-from directshape_torch.export.painted_cars import FrameView
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.shape.zero_level import sdf_to_mesh
 from directshape_torch.visualize.drawing import View
+from directshape_torch.visualize.painted_cars import FrameView
 
 K = np.array([[150.0, 0.0, 77.0], [0.0, 150.0, 50.0], [0.0, 0.0, 1.0]])
 PRIOR = ellipsoid_prior(spacing_m=0.1)

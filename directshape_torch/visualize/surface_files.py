@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.export.frame_source import Exporter, FrameSource, frame_numbers
-from directshape_torch.export.painted_cars import SEEN, Paint, ground_grid
 from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.files.mesh_files import T_GLTF_CAM
 from directshape_torch.visualize.drawing import Array
+from directshape_torch.visualize.frame_source import Exporter, FrameSource, frame_numbers
+from directshape_torch.visualize.painted_cars import SEEN, Paint, ground_grid
 
 if TYPE_CHECKING:
     import trimesh

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from directshape_torch.batch.run_log import OutputLostError, RunBeginning, RunEvent, RunLog, log_path, read_log
-from directshape_torch.batch.run_status import read_status
 from directshape_torch.errors import DataFormatError, RunInProgressError
+from directshape_torch.io.run_log import OutputLostError, RunBeginning, RunEvent, RunLog, log_path, read_log
+from directshape_torch.io.run_status import read_status
 
 # Does not end by itself: holds the folder until it is killed.
 HOLDER = """
 import sys, time
 from pathlib import Path
-from directshape_torch.batch.run_log import RunBeginning, RunLog
+from directshape_torch.io.run_log import RunBeginning, RunLog
 with RunLog(Path(sys.argv[1])) as log:
     log.begin(RunBeginning({}, 3))
     print("held", flush=True)

@@ -9,8 +9,8 @@ from directshape_torch.evaluation.matching import is_counted, match_to_labels
 from directshape_torch.evaluation.pose_error import errors_of
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.run_folder import FrameResult
-from directshape_torch.report.page_parts import known
 from directshape_torch.visualize.drawn_car import is_refined
+from directshape_torch.visualize.page_parts import known
 
 CarRow = dict[str, Any]
 """This is one car of the table by the names of its columns; None stands for unknown values."""

@@ -7,12 +7,12 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from directshape_torch.errors import InputError
-from directshape_torch.export.frame_source import Exporter, ExportOptions, FrameSource
-from directshape_torch.export.kitti_files import KittiExporter
-from directshape_torch.export.rerun_recording import RerunExporter
-from directshape_torch.export.surface_files import GlbExporter, PlyExporter, PointsExporter
 from directshape_torch.files.atomic_files import check_folder
+from directshape_torch.visualize.frame_source import Exporter, ExportOptions, FrameSource
+from directshape_torch.visualize.kitti_files import KittiExporter
+from directshape_torch.visualize.rerun_recording import RerunExporter
 from directshape_torch.visualize.run_frames import RunInputs
+from directshape_torch.visualize.surface_files import GlbExporter, PlyExporter, PointsExporter
 
 FORMATS: dict[str, type[Exporter]] = {
     "glb": GlbExporter,

@@ -10,22 +10,22 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.batch.run_log import read_log
-from directshape_torch.batch.run_status import read_status
-from directshape_torch.batch.verdict import verdict
 from directshape_torch.errors import InputError
 from directshape_torch.files.atomic_files import replaced_file
 from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.io.run_log import read_log
 from directshape_torch.io.run_manifest import flatten, hash_fields
+from directshape_torch.io.run_status import read_status
 from directshape_torch.refinement.trust import WORSE_BY
-from directshape_torch.report.car_rows import CarRow, car_rows, choose_frames
-from directshape_torch.report.frame_details import frame_details
-from directshape_torch.report.page_parts import data_block, data_url, mesh_data, page_frame
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, load_rigs
 from directshape_torch.status import Status
+from directshape_torch.visualize.car_rows import CarRow, car_rows, choose_frames
+from directshape_torch.visualize.frame_details import frame_details
+from directshape_torch.visualize.page_parts import data_block, data_url, mesh_data, page_frame
 from directshape_torch.visualize.run_frames import RunFrame, RunInputs
+from directshape_torch.visualize.verdict import verdict
 
 
 @dataclass(frozen=True)

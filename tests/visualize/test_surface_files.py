@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from directshape_torch.export.export_run import export_run
-from directshape_torch.export.frame_source import ExportOptions
-from directshape_torch.export.painted_cars import MIRRORED, NEUTRAL, NEUTRAL_RGB, SEEN
 from directshape_torch.io.frame_layout import FrameFiles
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.visualize.export_run import export_run
+from directshape_torch.visualize.frame_source import ExportOptions
+from directshape_torch.visualize.painted_cars import MIRRORED, NEUTRAL, NEUTRAL_RGB, SEEN
 
 Floats = NDArray[np.float64]
 LINES = (1, 3)

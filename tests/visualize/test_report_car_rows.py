@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from directshape_torch.files.text_files import Line
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
 from directshape_torch.io.run_folder import FrameRecord, FrameResult
-from directshape_torch.report.car_rows import CarRow, car_gains, car_rows, choose_frames
+from directshape_torch.visualize.car_rows import CarRow, car_gains, car_rows, choose_frames
 
 
 def car(x: float, u: float, line: int = 1, occluded: int = 0) -> KittiObject:

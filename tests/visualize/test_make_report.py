@@ -17,8 +17,8 @@ from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.comparison import compare_results
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import RunFolder
-from directshape_torch.report.make_report import ReportOutcome, make_report
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.visualize.make_report import ReportOutcome, make_report
 from directshape_torch.visualize.run_frames import RunInputs
 
 

@@ -11,9 +11,9 @@ import torch
 from directshape_torch.config import RefinerConfig
 from directshape_torch.io.result_files import ShapeArrays
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.report.page_parts import FRAME_QUALITY, data_url, mesh_data, numbers
 from directshape_torch.visualize.drawing import View, draw_box, draw_contour
 from directshape_torch.visualize.drawn_car import DrawnCar
+from directshape_torch.visualize.page_parts import FRAME_QUALITY, data_url, mesh_data, numbers
 from directshape_torch.visualize.residuals import draw_residuals, residual_maps
 from directshape_torch.visualize.run_frames import RunFrame
 

@@ -1,1 +1,0 @@
-"""This package exports a finished run in the formats of other programs."""
