@@ -393,6 +393,16 @@ def test_a_result_prints_all_of_its_cars() -> None:
     assert repr(result[:0]).splitlines()[1:] == ["  no cars"]
 
 
+def test_a_result_prints_whose_front_is_unknown() -> None:
+    result = refined()[[0, 1]]
+    assert "?" not in repr(result)
+    result.quality.probability_heading[1] = 0.5
+    *_, first, second, legend = repr(result).splitlines()
+    assert "?" not in first
+    assert f"{float(result.to_boxes('kitti')[1, 6]):.2f}?" in second
+    assert legend == "  ? either end may be the front (quality.probability_heading)"
+
+
 def test_a_result_of_many_cars_prints_those_that_need_a_look() -> None:
     """Car 90 has no mask, car 70 is doubtful; the first 38 of the others fill the table."""
     result = refined()[[0, 1] * 50]

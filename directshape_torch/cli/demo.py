@@ -81,7 +81,8 @@ def error_table(loaded: LoadedFrame, result: FrameResult) -> str:
     for row, (car, label) in enumerate(found.items()):
         figures = _columns([side[row : row + 1] for side in sides])
         depth = f"{label.location_ref[2]:.1f} m"
-        rows.append([str(before[car].line_number), depth, *figures, result.shapes.statuses[car]])
+        known = "" if result.shapes.is_front_known[car] else ", front unknown"
+        rows.append([str(before[car].line_number), depth, *figures, f"{result.shapes.statuses[car]}{known}"])
     return align([*rows, ["mean", "", *_columns(sides), ""]] if found else rows)
 
 

@@ -194,7 +194,7 @@ def _picture(item: LoadedFrame, car: DrawnCar) -> Picture:
     """The part of the left image around a car, with its box and contour; all parts have one size."""
     image = View.of_frame(item.frame)
     view = image.around(car.corners_cam, _SIZE_PX) or View(np.zeros((*_SIZE_PX[::-1], 3), np.uint8), image.P)
-    draw_box(view, car.corners_cam, car.colour)
+    draw_box(view, car.corners_cam, car.colour, car.is_front_known)
     if car.surface is not None:
         draw_contour(view, car.surface, car.colour)
     return titled(view.picture, f"{item.frame_id}: {car.distance_m:.1f} m, {car.status}")

@@ -17,6 +17,9 @@ from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.silhouette import MaskRows
 from directshape_torch.terms.term import Figures, Part, Prepared
 
+FRONT_KNOWN_FROM = 0.8
+"""The front of a car is called unknown below this probability."""
+
 # Images that show only noise have this contrast, in grey levels.
 _LEAST_CONTRAST = 0.3
 
@@ -49,6 +52,11 @@ class FitQuality(CarRecord):
     probability_better: Annotated[Tensor, Dense("B")]
     probability_not_worse: Annotated[Tensor, Dense("B")]
     probability_heading: Annotated[Tensor, Dense("B")]
+
+    @property
+    def is_front_known(self) -> Tensor:
+        """Whether (B,) the front of a car is where the result has it; a sense never questioned counts as known."""
+        return ~(self.probability_heading < FRONT_KNOWN_FROM)
 
 
 @torch.no_grad()

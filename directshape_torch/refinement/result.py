@@ -218,10 +218,13 @@ class RefinementResult(CarRecord):
         for place, (row, (x, y, z, _, _, length, heading)) in enumerate(zip(shown.tolist(), boxes, strict=True)):
             figures = quality.mask_iou_left, quality.probability_better, quality.probability_not_worse
             iou, better, not_worse = (float(figure[place]) for figure in figures)
+            sense = " " if quality.is_front_known[place] else "?"
             lines.append(
-                f"  {row:3d} {x:6.2f} {y:6.2f} {z:6.2f} {heading:8.2f} {length:7.2f} {iou:9.2f} "
+                f"  {row:3d} {x:6.2f} {y:6.2f} {z:6.2f} {heading:8.2f}{sense}{length:7.2f} {iou:9.2f} "
                 f"{better:7.2f} {not_worse:10.2f}  {chosen.status[place].name}"
             )
+        if not chosen.quality.is_front_known.all():
+            lines.append("  ? either end may be the front (quality.probability_heading)")
         return "\n".join(lines + left_out)
 
     def _printed_rows(self) -> tuple[Tensor, list[str]]:

@@ -144,7 +144,7 @@ class CarCourse:
         for corners_cam in truth:
             draw_footprint(ground, corners_cam, GREEN, 3)
         for place, (car, ink) in enumerate(zip(self.cars[:count], _step_inks(len(self.cars)), strict=False)):
-            draw_footprint(ground, car.corners_cam, ink, 2 if place == count - 1 else 1)
+            draw_footprint(ground, car.corners_cam, ink, 2 if place == count - 1 else 1, "", car.is_front_known)
         return ground.picture
 
 

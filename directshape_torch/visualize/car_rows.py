@@ -55,6 +55,7 @@ def _row(frame: int, result: FrameResult, car: int) -> CarRow:
         "photometric_error_grey": known(shapes.photometric_errors_grey[car], 2),  # mean, 0..255
         "probability_better": known(shapes.probabilities_better[car]),  # calibrated, as the next value
         "probability_not_worse": known(shapes.probabilities_not_worse[car]),
+        "probability_heading": known(shapes.probabilities_heading[car]),  # that the front is where the box has it
         "distance_in_sigmas": known(shapes.distances_in_sigmas[car], 2),  # between the boxes of images and detector
         "sigma_depth_m": known(shapes.sigmas_ref[car, 2]),
         "iterations": int(shapes.iterations[car]),

@@ -157,11 +157,21 @@ def draw_box(
     view: View,
     corners_cam: Array,  # (8, 3) in the order of `box_corners`
     colour: Colour,
+    is_front_known: bool = True,
 ) -> None:
-    """Draw the 12 edges of a 3D box, and a line on the ground from its centre to its front."""
+    """Draw the 12 edges of a 3D box, and its `line_to_front`."""
     for first, second in BOX_EDGES:
         draw_segment(view, corners_cam[first], corners_cam[second], colour)
-    draw_segment(view, corners_cam[:4].mean(axis=0), corners_cam[:2].mean(axis=0), colour)
+    draw_segment(view, *line_to_front(corners_cam, is_front_known), colour)
+
+
+def line_to_front(
+    corners_cam: Array,  # (8, 3) in the order of `box_corners`
+    is_front_known: bool,
+) -> tuple[Array, Array]:  # (3,), (3,)
+    """The ends of a line on the ground from the centre to the front, or from end to end where the front is unknown."""
+    front, rear = corners_cam[:2].mean(axis=0), corners_cam[2:4].mean(axis=0)
+    return 0.5 * (front + rear) if is_front_known else rear, front
 
 
 def draw_segment(view: View, first_cam: Array, second_cam: Array, colour: Colour) -> None:

@@ -40,6 +40,7 @@ class DrawnCar:
     mesh: trimesh.Trimesh | None  # the shape in its object frame, or None without a prior
     line: int  # of the detection file, or row of the call
     status: str | None = None  # status of the refinement; None before it
+    is_front_known: bool = True  # False where either end may be the front
 
     @property
     def surface(self) -> trimesh.Trimesh | None:
@@ -96,7 +97,10 @@ def cars_of_tensors(
     T_cam_obj, hwl = (x.detach().double().cpu() for x in (chosen.T_cam_obj, chosen.dimensions_hwl))
     code, rows = np.zeros(result.code.shape[1]), cars.tolist()
     boxes = np.asarray(box_corners(T_cam_obj, hwl))
-    before = [DrawnCar(T, box, code, mean, row) for T, box, row in zip(T_cam_obj.numpy(), boxes, rows, strict=True)]
+    marked = chosen.is_from_masks
+    known = [True] * len(rows) if marked is None else (~marked).tolist()
+    parts = zip(T_cam_obj.numpy(), boxes, rows, known, strict=True)
+    before = [DrawnCar(T, box, code, mean, row, None, front) for T, box, row, front in parts]
     return before, cars_of_result(result.rows(cars), rows, before)
 
 
@@ -107,8 +111,8 @@ def cars_of_result(
     boxes = result.boxes()
     corners = corners_cam(boxes.location_ref, boxes.rotation_y, boxes.dimensions_hwl, result.t_cam_ref)
     T_cam_obj, codes = (x.detach().cpu().numpy() for x in (result.T_cam_obj, result.code))
-    statuses = [status.name for status in result.status]
-    return cars_after(lines, statuses, T_cam_obj, codes, corners, before, result.prior)
+    statuses, fronts = [status.name for status in result.status], result.quality.is_front_known.tolist()
+    return cars_after(lines, statuses, T_cam_obj, codes, corners, fronts, before, result.prior)
 
 
 def corners_cam(location_ref: Tensor, rotation_y: Tensor, hwl: Tensor, t_cam_ref: Tensor) -> Array:
@@ -139,6 +143,7 @@ def cars_after(
     T_cam_obj: Array,  # (B, 4, 4)
     codes: Array,  # (B, K)
     corners: Array,  # (B, 8, 3) of the boxes, left camera frame
+    fronts: Sequence[bool],  # whether the front of each car is known
     before: Sequence[DrawnCar] | None,
     prior: ShapePrior | None,
     mesh_files: Sequence[Path | None] | None = None,
@@ -158,7 +163,7 @@ def cars_after(
             mesh = decoded_car(prior, code)
         elif mesh_files is not None and (file := mesh_files[car]) is not None:
             mesh = _saved_car(file, T)
-        cars.append(DrawnCar(T, corners[car], code, mesh, lines[car], status))
+        cars.append(DrawnCar(T, corners[car], code, mesh, lines[car], status, fronts[car]))
     return cars
 
 

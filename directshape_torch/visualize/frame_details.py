@@ -56,7 +56,7 @@ def _thumbnails(part: View | None, states: dict[str, DrawnCar]) -> dict[str, str
     for name, state in states.items():
         view = part.copy()
         if state.surface is None:
-            draw_box(view, state.corners_cam, state.colour)
+            draw_box(view, state.corners_cam, state.colour, state.is_front_known)
         else:
             draw_contour(view, state.surface, state.colour, 2)
         pictures[name] = data_url(view.picture)

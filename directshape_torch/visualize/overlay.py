@@ -32,6 +32,7 @@ from directshape_torch.visualize.drawing import (
     draw_legend,
     draw_line,
     draw_text,
+    line_to_front,
     titled,
 )
 from directshape_torch.visualize.drawn_car import DrawnCar, cars_of_tensors, drawn_cars, most_telling, true_corners
@@ -116,9 +117,9 @@ def overlay_picture(
     for corners_cam in truth_corners_cam:
         draw_footprint(ground, corners_cam, GREEN, 2)
     for car in before:
-        draw_footprint(ground, car.corners_cam, car.colour)
+        draw_footprint(ground, car.corners_cam, car.colour, is_front_known=car.is_front_known)
     for car in after:
-        draw_footprint(ground, car.corners_cam, car.colour, 2, f"{car.line}")
+        draw_footprint(ground, car.corners_cam, car.colour, 2, f"{car.line}", car.is_front_known)
     draw_line(ground, _CAMERA, GREY, closed=True)
     legend = {"before": ORANGE, "after": BLUE}
     legend |= {"ground truth": GREEN} if truth_corners_cam else {}
@@ -134,7 +135,7 @@ def _image_row(image: View, cars: Sequence[DrawnCar], title: str) -> Picture:
     view = image.part((0, 0, width, height), (round(scale * width), round(scale * height)))
     # Far cars come first, so that near cars are drawn over them.
     for car in sorted(cars, key=lambda one: -one.distance_m):
-        draw_box(view, car.corners_cam, car.colour)
+        draw_box(view, car.corners_cam, car.colour, car.is_front_known)
         height_px = float(view.K[1, 1]) * float(np.ptp(car.corners_cam[:, 1])) / max(car.distance_m, 1.0)
         if car.surface is not None:
             draw_contour(view, car.surface, car.colour, 2 if height_px > _TALL_PX else 1)
@@ -166,6 +167,7 @@ def _tile(image: View, before: DrawnCar, after: DrawnCar, size_wh: tuple[int, in
         draw_contour(view, car.surface, car.colour, 2)
         pictures.append(view.picture)
     ending = "" if after.is_refined else f", {after.status}"
+    ending += "" if after.is_front_known else ", front unknown"
     return titled(np.concatenate(pictures), f"{after.line}: {after.distance_m:.1f} m{ending}", size=0.8)
 
 
@@ -212,11 +214,12 @@ def draw_footprint(
     colour: Colour,
     thickness: int = 1,
     label: str = "",
+    is_front_known: bool = True,
 ) -> None:
-    """Draw a box from above, with a line from its centre to the front that shows the heading."""
+    """Draw a box from above, with its `line_to_front`, which shows the heading."""
     corners = corners_cam[:4]
     draw_line(ground, corners, colour, thickness, closed=True)
-    draw_line(ground, np.stack([corners.mean(axis=0), corners[:2].mean(axis=0)]), colour, thickness)
+    draw_line(ground, np.stack(line_to_front(corners_cam, is_front_known)), colour, thickness)
     if label:
         pixels = ground.project(corners)
         draw_text(ground.picture, label, (pixels[:, 0].max() + 4, pixels[:, 1].mean() + 8), colour, 0.9)

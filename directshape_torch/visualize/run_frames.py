@@ -138,8 +138,9 @@ class RunFrame:
             torch.from_numpy(x) for x in (shapes.boxes_location_ref, shapes.boxes_rotation_y, shapes.boxes_hwl)
         )
         corners = corners_cam(location_ref, rotation_y, hwl, self.t_cam_ref)
-        states = (shapes.input_lines.tolist(), shapes.statuses, shapes.T_cam_obj, shapes.codes, corners)
-        return cars_after(*states, self.before, self.inputs.prior, self.result.mesh_files)
+        of_shapes = (shapes.input_lines.tolist(), shapes.statuses, shapes.T_cam_obj, shapes.codes)
+        fronts = shapes.is_front_known.tolist()
+        return cars_after(*of_shapes, corners, fronts, self.before, self.inputs.prior, self.result.mesh_files)
 
     @property
     def truth_corners_cam(self) -> list[Array]:

@@ -18,6 +18,7 @@ from directshape_torch.visualize.drawing import (
     draw_box,
     draw_contour,
     draw_segment,
+    line_to_front,
     silhouette_mask,
     write_gif,
 )
@@ -102,6 +103,12 @@ def test_box_is_drawn_around_its_corners() -> None:
     assert abs(columns.max() - 61.1) <= 2
     assert abs(rows.min() - 28.9) <= 2
     assert abs(rows.max() - 51.1) <= 2
+
+
+def test_the_line_of_a_box_shows_its_front_only_where_it_is_known() -> None:
+    corners = np.array([[x, y, z] for y in (1.0, -1.0) for x, z in ((-1, 9), (1, 9), (1, 11), (-1, 11))], dtype=float)
+    for is_known, start in ((True, [0, 1, 10]), (False, [0, 1, 11])):
+        np.testing.assert_array_equal(line_to_front(corners, is_known), [start, [0, 1, 9]])
 
 
 @pytest.mark.parametrize("points", [[[0.0, 0.0, -5.0]], [[-90.0, 0.0, 10.0], [-80.0, 1.0, 10.0]]])

@@ -76,6 +76,7 @@ function figures(car, maps) {
     ["Length, width, height", `${number(car.length_m)}, ${number(car.width_m)}, ${number(car.height_m)} m`],
     ["Probably better than the input", percent(car.probability_better)],
     ["Probably not worse", percent(car.probability_not_worse)],
+    ...(car.probability_heading === null ? [] : [["Front is where the box has it", percent(car.probability_heading)]]),
     ["Standard deviations from the detector's box", number(car.distance_in_sigmas, 1)],
     ["IoU with the mask", number(car.mask_iou)],
     ["Difference of the images", `${number(car.photometric_error_grey, 1)} grey levels`],
