@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(
     reason="this PyTorch has no devices that are written in Python",
 )
 
-_TESTS = Path(__file__).parent
+_TESTS = Path(__file__).parents[1]
 _COMPARED = [
     "default",
     "product form, marched rays",

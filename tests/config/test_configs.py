@@ -16,7 +16,7 @@ from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import ConfigError
 from directshape_torch.io.config_files import BUNDLED_CONFIGS, config_to_mapping, load_config
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 CONFIGS = ROOT / "configs"
 
 

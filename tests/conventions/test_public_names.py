@@ -6,7 +6,7 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 # PyTorch's documentation tells users to take these by these names.
 DOCUMENTED = {"torch._dynamo.maybe_mark_dynamic", "torch.utils._python_dispatch.TorchDispatchMode"}
 # `compile.py` says what this is for, and does without it where it is missing.

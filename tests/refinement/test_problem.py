@@ -33,7 +33,7 @@ from directshape_torch.solver.gauss_newton import minimise
 from directshape_torch.state.cars import CarState
 from directshape_torch.terms.term import Evaluation, Figures
 
-DEMO = Path(__file__).parents[1] / "directshape_torch" / "assets" / "demo"
+DEMO = Path(__file__).parents[2] / "directshape_torch" / "assets" / "demo"
 SETS = {"demo": "noisy_stereo", "rendered": "stereo", "kitti": "noisy_stereo"}
 
 
