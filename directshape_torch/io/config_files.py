@@ -18,14 +18,6 @@ from directshape_torch.files.text_files import read_text
 BUNDLED_CONFIGS = ("default", "paper", "fast", "geometric", "combined")
 """These are the names of the settings that come with the package, for `load_config`."""
 
-# Each of these keys of earlier versions has something else in its place.
-_ALTERNATION = "each round is two entries of stages, as in the settings geometric"
-_GONE = {
-    "method": "leave it out for direct; else choose --config geometric or combined, or run scripts/align_boxes.py",
-    "point_cloud.order": _ALTERNATION,
-    "point_cloud.rounds": _ALTERNATION,
-    "point_cloud.max_iterations": _ALTERNATION,
-}
 # The YAML parser takes a second for ten thousand lines.
 _MOST_BYTES = 2**20
 _CONFIG_FOLDER = Path(__file__).parents[1] / "assets" / "configs"
@@ -61,8 +53,7 @@ def _from_mapping(cls: type[_GroupT], mapping: Mapping[str, Any], where: str, kn
     hints = cls.types()
     for key in mapping:
         if key not in hints:
-            cure = _GONE.get(f"{where}{key}") or _other_keys(str(key), where, list(hints), known)
-            raise ConfigError(f"unknown key {where}{key!s}; {cure}")
+            raise ConfigError(f"unknown key {where}{key!s}; {_other_keys(str(key), where, list(hints), known)}")
     values = {key: _convert(hints[key], value, f"{where}{key}", known) for key, value in mapping.items()}
     try:
         return cls(**values)
