@@ -17,7 +17,7 @@ from directshape_torch.cli.options import add_data_options, dataset_of
 from directshape_torch.cli.progress import Bar
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import check_file, write_png
-from directshape_torch.io.frame_layout import frames_among
+from directshape_torch.io.frame_choice import frames_among
 from directshape_torch.io.layouts import object_layout
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.from_files import (

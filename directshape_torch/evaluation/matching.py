@@ -12,7 +12,7 @@ from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.find_files import found, visible_files
 from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.io import folder_files
-from directshape_torch.io.frame_layout import frames_among, frames_of_split
+from directshape_torch.io.frame_choice import frames_among, frames_of_split
 from directshape_torch.io.kitti_labels import KittiObject, objects_in, objects_path, own_boxes_2d
 
 _MINIMUM_IOU_2D = 0.3

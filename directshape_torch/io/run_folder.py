@@ -22,7 +22,7 @@ from directshape_torch.files.find_files import is_frame_id
 from directshape_torch.files.read_files import parse_json, read_bytes
 from directshape_torch.files.schema import record_of
 from directshape_torch.io.config_files import config_from_mapping
-from directshape_torch.io.frame_layout import frames_among
+from directshape_torch.io.frame_choice import frames_among
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.result_files import ShapeArrays, read_shapes
 from directshape_torch.io.run_manifest import FrameEntry, hash_bytes, read_manifest

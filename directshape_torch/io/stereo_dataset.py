@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -14,13 +13,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.errors import DirectShapeError, InputError, shown
-from directshape_torch.files.find_files import is_frame_id
+from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.ground_plane import GroundPlane
 from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.io.frame_choice import chosen_frames
 from directshape_torch.io.frame_detections import build_detections
-from directshape_torch.io.frame_layout import FrameFiles, FrameLayout, existing_folder, frames_among, frames_of_split
+from directshape_torch.io.frame_layout import FrameFiles, FrameLayout, existing_folder
 from directshape_torch.io.image_files import read_disparity, read_pair
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_calibration import camera_of_rig, plane_ref_to_cam, to_stereo_camera
@@ -153,7 +152,7 @@ def open_dataset(
             )
     if ground not in get_args(GroundSource):
         raise InputError("ground", f"one of {', '.join(get_args(GroundSource))}", repr(ground))
-    frame_ids = _chosen_frames(layout, split, frames)
+    frame_ids = chosen_frames(layout, split, frames)
     first = layout.files(frame_ids[0])
     if layout.detections_dir is None and STARTED_CLASS not in classes:
         raise InputError("classes", f"{STARTED_CLASS}, of which masks are", ", ".join(classes), "give detections, too")
@@ -391,31 +390,3 @@ class StereoDataset:
 def _to_tensor(rgb: NDArray[np.uint8], dtype: torch.dtype) -> Tensor:
     """Image (1, 3, H, W) in [0, 1] from uint8 (H, W, 3)."""
     return torch.from_numpy(rgb).permute(2, 0, 1)[None].to(dtype).contiguous() / 255
-
-
-def _has_image(layout: FrameLayout, frame_id: str) -> bool:
-    """Whether there is a frame with the given name, which may be any word."""
-    try:
-        return layout.files(frame_id).left.is_file()
-    except InputError:
-        return False
-
-
-def _chosen_frames(
-    layout: FrameLayout, split: Path | str | None, frames: Iterable[str | int] | None
-) -> tuple[str, ...]:
-    known = layout.frame_ids()
-    known = known if split is None else frames_of_split(split, known, partial(_has_image, layout), layout.sequence)
-    folder = layout.detections_dir
-    where = f"{folder or 'the left images'}" if split is None else f"{split}"
-    if not known:
-        is_file = split is None and folder is not None
-        files = f"detection file {layout.detection_file_name} in" if is_file else "frame in"
-        cure = "name the folder that holds these files" if split is None else ""
-        raise InputError("frames", f"at least one {files} {where}", "none", cure)
-    known = known if frames is None else frames_among(known, frames, f"ids that occur in {where}")
-    for frame_id in known:
-        if not is_frame_id(frame_id):
-            where = "frames" if split is None else f"{split}, frames"
-            raise InputError(where, "names without folders", shown(frame_id), "rename the files")
-    return tuple(known)

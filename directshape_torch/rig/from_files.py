@@ -18,7 +18,8 @@ from torch import Tensor
 from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
 from directshape_torch.files.find_files import visible_files
 from directshape_torch.geometry.projection import project
-from directshape_torch.io.frame_layout import FrameFiles, frames_among
+from directshape_torch.io.frame_choice import frames_among
+from directshape_torch.io.frame_layout import FrameFiles
 from directshape_torch.io.image_files import read_disparity, read_pair, read_rgb
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.layouts import tracking_layout
