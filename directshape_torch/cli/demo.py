@@ -24,6 +24,7 @@ from directshape_torch.evaluation.tables import align
 from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.io.run_folder import FrameResult, RunFolder
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset, open_dataset
+from directshape_torch.refinement.quality import is_front_known
 from directshape_torch.visualize.frame_source import ExportOptions, FrameSource
 from directshape_torch.visualize.overlay import overlay_of_frame
 from directshape_torch.visualize.run_frames import RunInputs
@@ -81,7 +82,7 @@ def error_table(loaded: LoadedFrame, result: FrameResult) -> str:
     for row, (car, label) in enumerate(found.items()):
         figures = _columns([side[row : row + 1] for side in sides])
         depth = f"{label.location_ref[2]:.1f} m"
-        known = "" if result.shapes.is_front_known[car] else ", front unknown"
+        known = "" if is_front_known(result.shapes.probabilities_heading[car]) else ", front unknown"
         rows.append([str(before[car].line_number), depth, *figures, f"{result.shapes.statuses[car]}{known}"])
     return align([*rows, ["mean", "", *_columns(sides), ""]] if found else rows)
 

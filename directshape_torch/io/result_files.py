@@ -15,7 +15,6 @@ from directshape_torch.errors import DataFormatError, InputError, shown
 from directshape_torch.files import atomic_files
 from directshape_torch.files.array_files import read_npz, write_npz
 from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.refinement.quality import FRONT_KNOWN_FROM
 from directshape_torch.status import Status
 
 SHAPES_SCHEMA_VERSION = 5
@@ -131,11 +130,6 @@ class ShapeArrays:
         last = {"B": self.input_lines.shape, "K": self.codes.shape, "P": self.profile_offsets_px.shape}
         sizes = {letter: shape[-1] if shape else 0 for letter, shape in last.items()}
         check_shapes(self, {**sizes, "D": 6 + sizes["K"], "T": len(self.term_names)})
-
-    @property
-    def is_front_known(self) -> NDArray[np.bool_]:
-        """Whether (B,) the front of each car is known, see `FitQuality.is_front_known`."""
-        return np.logical_not(self.probabilities_heading < FRONT_KNOWN_FROM)
 
 
 def check_shapes(arrays: Any, sizes: Mapping[str, int]) -> None:

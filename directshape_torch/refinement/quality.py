@@ -17,9 +17,8 @@ from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.silhouette import MaskRows
 from directshape_torch.terms.term import Figures, Part, Prepared
 
-FRONT_KNOWN_FROM = 0.8
-"""The front of a car is called unknown below this probability."""
-
+# The front of a car is called unknown below this probability.
+_FRONT_KNOWN_FROM = 0.8
 # Images that show only noise have this contrast, in grey levels.
 _LEAST_CONTRAST = 0.3
 
@@ -53,10 +52,10 @@ class FitQuality(CarRecord):
     probability_not_worse: Annotated[Tensor, Dense("B")]
     probability_heading: Annotated[Tensor, Dense("B")]
 
-    @property
-    def is_front_known(self) -> Tensor:
-        """Whether (B,) the front of a car is where the result has it; a sense never questioned counts as known."""
-        return ~(self.probability_heading < FRONT_KNOWN_FROM)
+
+def is_front_known(probability_heading: float) -> bool:
+    """Whether the front of a car is called known; a sense that nobody questioned (NaN) is."""
+    return not probability_heading < _FRONT_KNOWN_FROM
 
 
 @torch.no_grad()

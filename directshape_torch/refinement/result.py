@@ -25,7 +25,7 @@ from directshape_torch.numerics.records import CarRecord, Dense
 from directshape_torch.refinement.disparity_profile import DisparityProfile
 from directshape_torch.refinement.fusion import DetectorComparison, level_boxes
 from directshape_torch.refinement.observability import Observability
-from directshape_torch.refinement.quality import FitQuality
+from directshape_torch.refinement.quality import FitQuality, is_front_known
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.shape.zero_level import sdf_to_mesh
@@ -215,15 +215,16 @@ class RefinementResult(CarRecord):
         lines.append("  car      x      y      z  heading  length  mask IoU  better  not worse  status")
         chosen = self.detach()[shown].cpu()
         boxes, quality = chosen.to_boxes("kitti").tolist(), chosen.quality
+        senses: list[str] = []
         for place, (row, (x, y, z, _, _, length, heading)) in enumerate(zip(shown.tolist(), boxes, strict=True)):
             figures = quality.mask_iou_left, quality.probability_better, quality.probability_not_worse
             iou, better, not_worse = (float(figure[place]) for figure in figures)
-            sense = " " if quality.is_front_known[place] else "?"
+            senses.append(" " if is_front_known(float(quality.probability_heading[place])) else "?")
             lines.append(
-                f"  {row:3d} {x:6.2f} {y:6.2f} {z:6.2f} {heading:8.2f}{sense}{length:7.2f} {iou:9.2f} "
+                f"  {row:3d} {x:6.2f} {y:6.2f} {z:6.2f} {heading:8.2f}{senses[-1]}{length:7.2f} {iou:9.2f} "
                 f"{better:7.2f} {not_worse:10.2f}  {chosen.status[place].name}"
             )
-        if not chosen.quality.is_front_known.all():
+        if "?" in senses:
             lines.append("  ? either end may be the front (quality.probability_heading)")
         return "\n".join(lines + left_out)
 

@@ -15,6 +15,7 @@ from directshape_torch.files.mesh_files import T_GLTF_CAM, read_mesh
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.kitti_labels import KittiObject, box_corners_cam, poses_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.refinement.quality import is_front_known
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.scene.detections import Detections
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -111,7 +112,8 @@ def cars_of_result(
     boxes = result.boxes()
     corners = corners_cam(boxes.location_ref, boxes.rotation_y, boxes.dimensions_hwl, result.t_cam_ref)
     T_cam_obj, codes = (x.detach().cpu().numpy() for x in (result.T_cam_obj, result.code))
-    statuses, fronts = [status.name for status in result.status], result.quality.is_front_known.tolist()
+    statuses = [status.name for status in result.status]
+    fronts = [is_front_known(each) for each in result.quality.probability_heading.tolist()]
     return cars_after(lines, statuses, T_cam_obj, codes, corners, fronts, before, result.prior)
 
 

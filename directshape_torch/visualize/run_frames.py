@@ -17,6 +17,7 @@ from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.run_folder import FrameResult, RunFolder, shapes_path
 from directshape_torch.io.run_manifest import hash_file, hash_prior
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
+from directshape_torch.refinement.quality import is_front_known
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.visualize.drawing import Array
 from directshape_torch.visualize.drawn_car import (
@@ -139,7 +140,7 @@ class RunFrame:
         )
         corners = corners_cam(location_ref, rotation_y, hwl, self.t_cam_ref)
         of_shapes = (shapes.input_lines.tolist(), shapes.statuses, shapes.T_cam_obj, shapes.codes)
-        fronts = shapes.is_front_known.tolist()
+        fronts = [is_front_known(each) for each in shapes.probabilities_heading.tolist()]
         return cars_after(*of_shapes, corners, fronts, self.before, self.inputs.prior, self.result.mesh_files)
 
     @property
