@@ -179,7 +179,8 @@ def inspect_tracks(loaded: Sequence[LoadedFrame], refiner: DirectShapeRefiner, o
     first_row = 0
     for item in loaded:
         ids, part = item.detections.track_id, result[first_row : first_row + len(item.detections)]
-        for car, number in zip(drawn_cars(item, part)[1], [] if ids is None else ids.tolist(), strict=True):
+        cars = drawn_cars(item.detections, part, [one.line_number for one in item.detected_objects])[1]
+        for car, number in zip(cars, [] if ids is None else ids.tolist(), strict=True):
             pictures.setdefault(track_name(item.sequence or "", number), []).append(_picture(item, car))
         first_row += len(item.detections)
     paths = []

@@ -14,7 +14,6 @@ from torch import Tensor
 from directshape_torch.files.mesh_files import T_GLTF_CAM, read_mesh
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.kitti_labels import KittiObject, box_corners_cam, poses_cam
-from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refinement.quality import is_front_known
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.scene.detections import Detections
@@ -69,18 +68,6 @@ def is_refined(status: str) -> bool:
     return status in Status.__members__ and Status[status].is_refined
 
 
-def drawn_cars(
-    loaded: LoadedFrame,
-    result: RefinementResult,
-    cars: Tensor | None = None,  # (M,) rows
-) -> tuple[list[DrawnCar], list[DrawnCar]]:
-    """The cars of a refined frame, or some of them, before and after."""
-    cars = torch.arange(len(result)) if cars is None else cars
-    objects, t_cam_ref = [loaded.detected_objects[row] for row in cars.tolist()], loaded.frame.camera.t_cam_ref[0]
-    before = cars_before(objects, t_cam_ref, mean_car(result.prior), result.code.shape[1])
-    return before, cars_of_result(result.rows(cars), [one.line_number for one in objects], before)
-
-
 def most_telling(result: RefinementResult, cars: Tensor) -> Tensor:
     """At most 60 cars, rows (M,), in their order: the refined ones first, then the nearest."""
     depth, refined = (x.detach().cpu()[cars] for x in (result.T_cam_obj[:, 2, 3], result.refined))
@@ -88,21 +75,16 @@ def most_telling(result: RefinementResult, cars: Tensor) -> Tensor:
     return cars[order[:_MOST_CARS].sort().values]
 
 
-def cars_of_tensors(
-    detections: Detections,
-    result: RefinementResult,
-    cars: Tensor,  # (M,) rows of both
+def drawn_cars(
+    detections: Detections, result: RefinementResult, lines: Sequence[int]
 ) -> tuple[list[DrawnCar], list[DrawnCar]]:
-    """Some cars of a call before and after, numbered by their rows; their detected boxes must be finite."""
-    chosen, mean = detections.rows(cars), mean_car(result.prior)
-    T_cam_obj, hwl = (x.detach().double().cpu() for x in (chosen.T_cam_obj, chosen.dimensions_hwl))
-    code, rows = np.zeros(result.code.shape[1]), cars.tolist()
-    boxes = np.asarray(box_corners(T_cam_obj, hwl))
-    marked = chosen.is_from_masks
-    known = [True] * len(rows) if marked is None else (~marked).tolist()
-    parts = zip(T_cam_obj.numpy(), boxes, rows, known, strict=True)
-    before = [DrawnCar(T, box, code, mean, row, None, front) for T, box, row, front in parts]
-    return before, cars_of_result(result.rows(cars), rows, before)
+    """The cars of a call before and after, with their line numbers; their detected boxes must be finite."""
+    mean, code, marked = mean_car(result.prior), np.zeros(result.code.shape[1]), detections.is_from_masks
+    T_cam_obj, hwl = (x.detach().double().cpu() for x in (detections.T_cam_obj, detections.dimensions_hwl))
+    known = [True] * len(lines) if marked is None else (~marked).tolist()
+    states = zip(T_cam_obj.numpy(), box_corners(T_cam_obj, hwl).numpy(), lines, known, strict=True)
+    before = [DrawnCar(T, box, code, mean, line, None, front) for T, box, line, front in states]
+    return before, cars_of_result(result, lines, before)
 
 
 def cars_of_result(

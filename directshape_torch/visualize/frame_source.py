@@ -73,17 +73,9 @@ class FrameSource(RunFrame):
 
 
 class Exporter:
-    """An `Exporter` writes a run in one format into a folder.
-
-    Raises:
-        InputError: the exporter needs images but there is no data set.
-    """
-
-    needs_images_for = ""  # purpose of the images if the exporter needs them
+    """An `Exporter` writes a run in one format into a folder."""
 
     def __init__(self, folder: Path, inputs: RunInputs, options: ExportOptions) -> None:
-        if self.needs_images_for and inputs.dataset is None:
-            raise InputError("--data", f"the data set of the run, for {self.needs_images_for}", "nothing")
         self.folder, self.inputs, self.options = folder, inputs, options
 
     def add(self, source: FrameSource) -> None:

@@ -35,7 +35,7 @@ from directshape_torch.visualize.drawing import (
     line_to_front,
     titled,
 )
-from directshape_torch.visualize.drawn_car import DrawnCar, cars_of_tensors, drawn_cars, most_telling, true_corners
+from directshape_torch.visualize.drawn_car import DrawnCar, drawn_cars, most_telling, true_corners
 
 _LEAST_WIDTH_PX = 1000
 _BIRDS_EYE_WIDTH_PX = 560
@@ -86,16 +86,18 @@ def overlay(frames: FrameBatch, detections: Detections, result: RefinementResult
         raise InputError("frame", f"a number of 0..{len(frames) - 1}", shown(frame))
     drawable = detections.T_cam_obj.isfinite().flatten(1).all(dim=1) & detections.dimensions_hwl.isfinite().all(dim=1)
     cars = ((detections.frame_index == frame) & drawable.to(detections.frame_index.device)).nonzero().flatten().cpu()
-    before, after = cars_of_tensors(detections, result, most_telling(result, cars))
+    rows = most_telling(result, cars)
+    before, after = drawn_cars(detections.rows(rows), result.rows(rows), rows.tolist())
     view = View.of_frame(frames, number=int(frame))
     return overlay_picture(view, before, after, title=f"frame {frames.frame_ids[frame]}")
 
 
 def overlay_of_frame(loaded: LoadedFrame, result: RefinementResult) -> Picture:
     """The picture (h, w, 3), RGB, of a refined frame."""
-    before, after = drawn_cars(loaded, result, most_telling(result, torch.arange(len(result))))
-    classes = [one.type for one in loaded.detected_objects]
-    truth = true_corners(loaded.labels, classes, loaded.frame.camera.t_cam_ref[0])
+    rows, detected = most_telling(result, torch.arange(len(result))), loaded.detected_objects
+    lines = [detected[row].line_number for row in rows.tolist()]
+    before, after = drawn_cars(loaded.detections.rows(rows), result.rows(rows), lines)
+    truth = true_corners(loaded.labels, [one.type for one in detected], loaded.frame.camera.t_cam_ref[0])
     return overlay_picture(View.of_frame(loaded.frame), before, after, truth, f"frame {loaded.frame_id}")
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.errors import MissingDependencyError
+from directshape_torch.errors import InputError, MissingDependencyError
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene.masks import MASK_THRESHOLD
@@ -43,13 +43,14 @@ class RerunExporter(Exporter):
 
     Raises:
         MissingDependencyError: Rerun is not installed.
+        InputError: there is no data set.
     """
-
-    needs_images_for = "the pictures of a recording"
 
     def __init__(self, *args: Any) -> None:
         _import_rerun()
         super().__init__(*args)
+        if self.inputs.dataset is None:
+            raise InputError("--data", "the data set of the run, for the pictures of a recording", "nothing")
         self.numbers, self.iteration = frame_numbers(self.inputs.run.frame_ids), 0
         self._stream: _Stream | None = None
 
