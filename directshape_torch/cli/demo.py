@@ -22,9 +22,8 @@ from directshape_torch.evaluation.matching import match_to_labels
 from directshape_torch.evaluation.pose_error import CarErrors, errors_of
 from directshape_torch.evaluation.tables import align
 from directshape_torch.files.atomic_files import write_bytes
-from directshape_torch.io.run_folder import FrameResult, RunFolder
-from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset, open_dataset
-from directshape_torch.refinement.quality import is_front_known
+from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.io.stereo_dataset import StereoDataset, open_dataset
 from directshape_torch.visualize.frame_source import ExportOptions, FrameSource
 from directshape_torch.visualize.overlay import overlay_of_frame
 from directshape_torch.visualize.run_frames import RunInputs
@@ -66,24 +65,25 @@ def run(args: argparse.Namespace) -> int:
         (frame_id,) = dataset.frame_ids
         frame = FrameSource(RunInputs(RunFolder(args.out), refiner.prior, dataset), frame_id, ExportOptions())
         write_bytes(args.out / "scene.glb", frame_glb(frame))
-    print(error_table(frame.with_images, frame.result))
+    print(error_table(frame))
     print(format_summary(summary))
     print(f"picture  {args.out / 'overlays' / f'{frame_id}.png'}")
     print(f"scene    {args.out / 'scene.glb'}")
     return summary.exit_code
 
 
-def error_table(loaded: LoadedFrame, result: FrameResult) -> str:
+def error_table(frame: FrameSource) -> str:
     """A table of centre, heading and bird's-eye IoU of each car against its label, before and after."""
-    before, after = loaded.detected_objects, result.cars
-    found = match_to_labels(before, loaded.labels or [])
+    before, after = frame.with_images.detected_objects, frame.result.cars
+    found = match_to_labels(before, frame.labels or [])
     sides = [errors_of([objects[car] for car in found], list(found.values())) for objects in (before, after)]
     rows = [["car", "depth", "centre [m]", "yaw [deg]", "BEV IoU", "status"]]
     for row, (car, label) in enumerate(found.items()):
         figures = _columns([side[row : row + 1] for side in sides])
         depth = f"{label.location_ref[2]:.1f} m"
-        known = "" if is_front_known(result.shapes.probabilities_heading[car]) else ", front unknown"
-        rows.append([str(before[car].line_number), depth, *figures, f"{result.shapes.statuses[car]}{known}"])
+        drawn = frame.after[car]
+        known = "" if drawn.is_front_known else ", front unknown"
+        rows.append([str(drawn.line), depth, *figures, f"{drawn.status}{known}"])
     return align([*rows, ["mean", "", *_columns(sides), ""]] if found else rows)
 
 
