@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import pytest
@@ -14,7 +13,6 @@ from helpers.problems import DEFAULT
 from helpers.street_inputs import SETTLED, summary, with_mode
 from helpers.synthetic_scene import (
     CAMERA_HEIGHT_M,
-    Street,
     cached_street,
     disturbed,
     joined_detections,
@@ -23,66 +21,20 @@ from helpers.synthetic_scene import (
     select,
     street,
 )
+from helpers.track_drive import assert_same, by_themselves, doubt, drive, of_tracks, refined
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.errors import InputError
-from directshape_torch.refinement import make_result
-from directshape_torch.refinement import refined as refinements
-from directshape_torch.refinement.problem import CarMinimum, CarProblem
-from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.trust import EVIDENCE_NAMES
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
-from directshape_torch.solver.problem import where_rows
-from directshape_torch.solver.sharing import Groups
-from directshape_torch.state.unknowns import POSE, AnyState
+from directshape_torch.state.unknowns import POSE
 from directshape_torch.status import Status
 from directshape_torch.terms.priors import PriorTerm, height_prior
 from directshape_torch.tracks import same_car, share
-
-HEADINGS = (0.3, 1.2, 2.4)
-
-
-@cache
-def drive(contrast: float = 1.0) -> tuple[FrameBatch, Detections, Tensor]:
-    """Three frames of a car that turns and of a still one: frames, disturbed boxes, the true codes."""
-    prior = ellipsoid_prior()
-    code = contrast * torch.tensor([[0.9, -0.4, 0.5], [-0.8, 0.3, -0.4]], dtype=torch.float64)
-    height = CAMERA_HEIGHT_M
-    seen: list[Street] = [
-        street(prior, [(-1.3, height, 8.0 + n), (2.1, height, 12.0 - n)], [heading, -1.2], code)
-        for n, heading in enumerate(HEADINGS)
-    ]
-    frames = joined_frames([view.frames for view in seen])
-    detections = joined_detections([view.detections for view in seen], (120, 160))
-    mean = prior.dimensions_and_derivative(torch.zeros_like(detections.T_cam_obj[:, :3, 0])).hwl
-    return frames, replace(disturbed(detections), dimensions_hwl=mean), code.repeat(len(seen), 1)
-
-
-def refined(detections: Detections, track_id: list[int] | None = None, contrast: float = 1.0) -> RefinementResult:
-    ids = None if track_id is None else torch.tensor(track_id)
-    return DirectShapeRefiner(ellipsoid_prior(), DEFAULT)(drive(contrast)[0], replace(detections, track_id=ids))
-
-
-@cache
-def by_themselves() -> RefinementResult:
-    """The result of all six detections without tracks, which must not be changed."""
-    return refined(drive()[1])
-
-
-@cache
-def of_tracks(*track_id: int) -> RefinementResult:
-    """The result of the six detections with these tracks, which must not be changed."""
-    return refined(drive()[1], list(track_id))
-
-
-def assert_same(one: RefinementResult, other: RefinementResult) -> None:
-    first, second = one.state_dict(), other.state_dict()
-    for name, values in first.items():
-        assert torch.equal(torch.nan_to_num(values), torch.nan_to_num(second[name])), name
 
 
 def test_tracks_of_one_view_are_cars_by_themselves_to_the_bit() -> None:
@@ -208,104 +160,6 @@ def test_a_view_that_the_images_do_not_confirm_does_not_join() -> None:
     rows = [0, 1, 3, 4, 5]
     assert torch.equal(result.T_cam_obj[rows], without.T_cam_obj[rows])
     assert (result.code[4] == result.code[0]).all()
-
-
-def doubt(monkeypatch: pytest.MonkeyPatch, *in_track: int, alone: int | None = None, num_rows: int = 6) -> list[int]:
-    """Make views untrusted in calls or tracks of so many rows; return the sizes of all calls."""
-    sizes: list[int] = []
-
-    def judged(
-        minimum: CarMinimum[AnyState], initial: AnyState, *args: Any
-    ) -> tuple[CarMinimum[AnyState], RefinementResult]:
-        minimum, found = make_result.judged(minimum, initial, *args)
-        sizes.append(len(minimum.status))
-        rows = in_track if isinstance(minimum.stage.problem.sharing, Groups) else (alone,)
-        if len(minimum.status) != num_rows:
-            return minimum, found
-        doubtful = torch.tensor([row in rows for row in range(num_rows)])
-        status = torch.where(doubtful, Status.not_trusted.code, minimum.status)
-        state = where_rows(doubtful, initial, minimum.state)
-        return replace(minimum, state=state, status=status), replace(found, status_code=status)
-
-    monkeypatch.setattr(refinements, "judged", judged)
-    return sizes
-
-
-def test_a_view_that_is_not_trusted_alone_is_where_its_track_makes_it_trusted(monkeypatch: pytest.MonkeyPatch) -> None:
-    together = of_tracks(*[0, 1] * 3)
-    doubt(monkeypatch, alone=2)
-    assert refined(drive()[1]).status[2] == Status.not_trusted
-    assert_same(refined(drive()[1], [0, 1] * 3), together)
-
-
-@pytest.mark.parametrize("in_track", [(2,), (0, 4)])
-def test_a_view_that_is_not_trusted_in_good_company_leaves_the_track_as_without_it(
-    monkeypatch: pytest.MonkeyPatch, in_track: tuple[int, ...]
-) -> None:
-    """It is not trusted in its track, or alone is."""
-    _, detections, _ = drive()
-    without = of_tracks(0, 1, -1, 1, 0, 1)
-    sizes = doubt(monkeypatch, *in_track, alone=2)
-    result = refined(detections, [0, 1] * 3)
-    assert sizes == [6, 6, 5]
-    assert result.status[2] == Status.not_trusted
-    assert torch.equal(result.T_cam_obj[2], detections.T_cam_obj[2])
-    others = [0, 1, 3, 4, 5]
-    for name in ("T_cam_obj", "code", "covariance", "cost_after"):
-        assert torch.equal(getattr(result, name)[others], getattr(without, name)[others]), name
-
-
-def test_a_view_that_is_not_trusted_alone_splits_no_track(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(same_car, "_MOST_EVIDENCE", 3.0)
-    _, detections, _ = drive(contrast=2.5)
-    parts: list[list[list[list[int]]]] = []
-
-    def recorded(*args: Any) -> list[list[list[int]]]:
-        parts.append(same_car.parts_by_shape(*args))
-        return parts[-1]
-
-    monkeypatch.setattr(share, "parts_by_shape", recorded)
-    doubt(monkeypatch, alone=4)
-    refined(detections, [0, 1, 0, 1, 1, 0], contrast=2.5)
-    assert parts[0] == [[[0, 2], [5]], [[1, 3, 4]]]
-
-
-def test_a_view_that_is_not_trusted_in_its_track_keeps_what_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, detections, _ = drive()
-    alone, trusted = by_themselves(), of_tracks(*[0, 1] * 3)
-    doubt(monkeypatch, 2)
-    result = refined(detections, [0, 1] * 3)
-    others = [0, 1, 3, 4, 5]
-    for name, values in result.state_dict().items():
-        if name in ("T_cam_obj", "code", "covariance", "cost_after", "quality.mask_iou_left"):
-            # A track has columns of costs more.
-            own = values[2, : len(alone.term_names)] if name == "cost_after" else values[2]
-            assert torch.equal(own, alone.state_dict()[name][2]), name
-            assert torch.equal(values[others], trusted.state_dict()[name][others]), name
-    assert result.status == [Status.converged] * 6
-
-
-def test_a_view_that_leaves_midway_leaves_the_track_as_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, detections, _ = drive()
-    without = of_tracks(0, 1, -1, 1, 0, 1)
-    minimise = refinements.minimise
-
-    def failing(problem: CarProblem, *others: Any) -> CarMinimum[AnyState]:
-        minimum = minimise(problem, *others)
-        if not isinstance(problem.sharing, Groups) or len(minimum.status) < 6:
-            return minimum
-        return replace(minimum, status=minimum.status.index_fill(0, torch.tensor([2]), Status.singular.code))
-
-    monkeypatch.setattr(refinements, "minimise", failing)
-    assert_same(refined(detections, [0, 1] * 3), without)
-
-
-def test_a_view_whose_track_has_no_other_that_is_trusted_has_a_shape_of_its_own(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    _, detections, _ = drive()
-    doubt(monkeypatch, 1, num_rows=4)
-    assert refined(detections, [0, -1, 0, 1, -1, 1]).track_part.tolist() == [-1, -1, -1, 0, -1, 0]
 
 
 @pytest.mark.parametrize(
