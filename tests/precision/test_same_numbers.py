@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from public_functions import CASES, WITHOUT_NUMBERS, numbers, public_names
+from inexact_numbers import numbers
+from public_functions import CASES, WITHOUT_NUMBERS, public_names
 from torch import Tensor
 
 HALF = (torch.bfloat16, torch.float16)
