@@ -47,8 +47,9 @@ class Status(enum.Enum):
         "all the same"
     )
     no_start = (
-        "no box could be made of the mask: under it are too few disparities, or nothing of a car's size on the road; "
-        "check that mask and images are of one frame, and the ground plane, or give a box of a detector"
+        "no box could be made of the mask: under it are too few disparities, nothing of a car's size on the road, or "
+        "more than one car; check that mask and images are of one frame, and the ground plane, or give a box of a "
+        "detector"
     )
 
     @property

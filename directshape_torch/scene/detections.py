@@ -222,8 +222,8 @@ class Detections(TensorRecord):
         A mean car's rectangle is fitted to the stereo points of each mask, seen from above, from all headings. The
         ground plane gives the height. Which end of a car is its front is not known from this: the heading is known
         modulo half a turn, and each car is taken to be seen from behind, as most are. A mask that shows too
-        little disparity, or nothing of a car's size on the road, gets a pose of NaN and, from a refiner, the status
-        `no_start`.
+        little disparity, nothing of a car's size on the road, or more than one car, gets a pose of NaN and, from a
+        refiner, the status `no_start`.
 
         The boxes are made of the same disparities that a rig would be checked with, so they are no evidence of it
         (`is_from_masks`): frames need a camera whose disparity is right, or a known `disparity_field`, such as

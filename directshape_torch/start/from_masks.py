@@ -13,8 +13,9 @@ from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.scene.masks import MaskCrops
-from directshape_torch.start.mask_points import MaskPoints, points_under
-from directshape_torch.start.rectangle_fit import MEAN_HWL, InstancePoints, fit_rectangles
+from directshape_torch.start.mask_points import MaskPoints, depth_noise, height_above_ground, points_under
+from directshape_torch.start.rectangle_fit import MEAN_HWL, InstancePoints, distance_outside, fit_rectangles, outline_of
+from directshape_torch.start.seen_ends import ends_seen
 from directshape_torch.stereo_matching.disparity import with_disparity
 
 # A mask with fewer known disparities, or with a smaller share of them, shows no car.
@@ -23,12 +24,13 @@ _FEWEST_POINTS, _LEAST_KNOWN_SHARE = 30, 0.1
 _REACH_M = 4.5
 # Bumpers and doors are near the rectangle of a car; wheels, bonnet and windows count for less.
 _BAND_M, _OFF_BAND_WEIGHT = (0.25, 1.0), 0.1
-# The mask is cut off where it comes this near to the border of the image.
-_BORDER_PX = 2
 # Height and width in the image, and distance, that the mask of a car can have.
 _HEIGHT_M, _WIDTH_M, _DEPTH_M = (0.4, 2.4), (0.5, 6.5), (2.0, 80.0)
 # Median height of a car's points above the road, which may be known badly, and median deviation from it.
 _MIDDLE_M, _SPREAD_M = (-0.5, 2.0), (0.08, 1.0)
+# Of the points under the mask of one car at most this share lies beside its rectangle, by this distance and their
+# noise, and its columns go on beyond those of its rectangle by at most this.
+_BESIDE_SHARE, _BESIDE_M, _BEYOND_M = 0.3, 0.5, 0.4
 # The fit of a car has at most this robust cost, square metres.
 _LARGEST_COST = 0.12
 # This many instances are fitted at once, which limits the memory.
@@ -46,10 +48,13 @@ def start_boxes(
 ) -> Detections:
     """The detections of `Detections.from_masks`."""
     _check_frame_index(frame_index, len(frames))
-    seen = _near_each_other(points_under(with_disparity(frames, needed=frame_index), mask_left, frame_index))
-    above = _height_above_ground(seen.points_cam, frames, frame_index)
+    frames = with_disparity(frames, needed=frame_index)
+    under = points_under(frames, mask_left, frame_index)
+    seen = _near_each_other(under)
+    above = height_above_ground(seen.points_cam, frames, frame_index)
     place, cost = _placed(frames, mask_left, frame_index, seen, above)
     is_car = _looks_like_a_car(frames, mask_left, frame_index, seen, above, place, cost)
+    is_car = is_car & _is_one_car(frames, mask_left, frame_index, under.points_cam, place)
     x, z, heading, length, width = place.unbind(-1)
     normal, offset = (each[frame_index] for each in (frames.ground.normal, frames.ground.offset))
     y = -(normal[:, 0] * x + normal[:, 2] * z + offset) / normal[:, 1]
@@ -79,12 +84,6 @@ def _near_each_other(seen: MaskPoints) -> MaskPoints:
     return seen._replace(points_cam=torch.where(is_near, seen.points_cam, torch.nan))
 
 
-def _height_above_ground(points_cam: Tensor, frames: FrameBatch, frame_index: Tensor) -> Tensor:
-    """Heights (M, P) of points above the road, metres."""
-    normal, offset = (each[frame_index] for each in (frames.ground.normal, frames.ground.offset))
-    return (points_cam * normal[:, None]).sum(-1) + offset[:, None]
-
-
 def _placed(
     frames: FrameBatch, masks: MaskCrops, frame_index: Tensor, seen: MaskPoints, above: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -92,15 +91,12 @@ def _placed(
     xz = seen.points_cam[..., 0::2]
     on_band = (above > _BAND_M[0]) & (above < _BAND_M[1])
     weight = torch.where(on_band, torch.ones_like(above), _OFF_BAND_WEIGHT) * above.isfinite()
-    K, width = frames.camera.K_left[frame_index], frames.sizes[frame_index, 1:]
-    columns = masks.extents[:, 0::2]
     of_instances = InstancePoints(
         xz=xz.nan_to_num(),
         weight=weight / weight.sum(dim=1, keepdim=True),
         middle=xz.nanmedian(dim=1).values,
-        # The border of a column of pixels lies half a pixel beside its centre.
-        outline=(columns - 0.5 - K[:, 0, 2:]) / K[:, 0, :1],
-        is_outline_known=torch.cat([columns[:, :1] > _BORDER_PX, columns[:, 1:] < width - _BORDER_PX], dim=1),
+        outline=_outline(frames, masks, frame_index),
+        is_end_seen=ends_seen(frames, masks, frame_index, seen.points_cam),
     )
     best, costs = [of_instances.xz.new_zeros(0, 5)], [xz.new_zeros(0)]
     for first in range(0, len(xz), _PORTION):
@@ -109,6 +105,13 @@ def _placed(
         best.append(fitted.place.gather(1, chosen[:, None, None].expand(-1, 1, 5))[:, 0])
         costs.append(cost)
     return torch.cat(best), torch.cat(costs)
+
+
+def _outline(frames: FrameBatch, masks: MaskCrops, frame_index: Tensor) -> Tensor:
+    """x / z (M, 2) of the first and the last column of masks."""
+    K = frames.camera.K_left[frame_index]
+    # The border of a column of pixels lies half a pixel beside its centre.
+    return (masks.extents[:, 0::2] - 0.5 - K[:, 0, 2:]) / K[:, 0, :1]
 
 
 def _looks_like_a_car(
@@ -135,6 +138,15 @@ def _looks_like_a_car(
     )
     fits = [(value >= low) & (value <= high) for value, (low, high) in ranges]  # NaN is in no range
     return torch.stack([enough, *fits]).all(dim=0)
+
+
+def _is_one_car(frames: FrameBatch, masks: MaskCrops, frame_index: Tensor, points_cam: Tensor, place: Tensor) -> Tensor:
+    """Whether (M,) a rectangle explains the points (M, P, 3) under its mask, and the columns of the mask."""
+    off = distance_outside(place, points_cam[..., 0::2])
+    is_beside = off > _BESIDE_M + depth_noise(frames, frame_index, points_cam[..., 2])  # NaN is not above it
+    share = is_beside.sum(dim=1) / off.isfinite().sum(dim=1)
+    beyond = (outline_of(place) - _outline(frames, masks, frame_index)) * place[:, 1:2]
+    return (share <= _BESIDE_SHARE) & (beyond[:, 0] <= _BEYOND_M) & (-beyond[:, 1] <= _BEYOND_M)
 
 
 def _facing(x: Tensor, z: Tensor, heading: Tensor) -> Tensor:

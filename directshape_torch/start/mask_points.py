@@ -15,6 +15,8 @@ from directshape_torch.scene.masks import MASK_THRESHOLD, MaskCrops
 _MOST_PIXELS, _MOST_POINTS = 1600, 200
 # Disparities below this are of objects beyond every car, or wrong.
 _LEAST_DISPARITY_PX = 2.0
+# Disparities on glass and paint are off by as much as this.
+_NOISE_PX = 0.5
 
 
 class MaskPoints(NamedTuple):
@@ -50,6 +52,18 @@ def points_under(
     of_right = camera.K_right[f], camera.T_right_cam[f]
     points = points_from_disparity(uv, uvd[..., 2], K_left, *of_right, camera.disparity_field)
     return MaskPoints(points, num_known.to(points) / num_inner.clamp_min(1), num_known)
+
+
+def height_above_ground(points_cam: Tensor, frames: FrameBatch, frame_index: Tensor) -> Tensor:
+    """Heights (M, P) of points (M, P, 3) above the road, metres."""
+    normal, offset = (each[frame_index] for each in (frames.ground.normal, frames.ground.offset))
+    return (points_cam * normal[:, None]).sum(-1) + offset[:, None]
+
+
+def depth_noise(frames: FrameBatch, frame_index: Tensor, depth: Tensor) -> Tensor:
+    """The errors (M, ...) of depths (M, ...) of matched pixels, metres."""
+    focal_baseline = frames.camera.K_left[:, 0, 0] * frames.camera.baseline
+    return _NOISE_PX * depth.square() / focal_baseline[frame_index].view(-1, *[1] * (depth.ndim - 1))
 
 
 def _inner_pixels(masks: MaskCrops) -> tuple[Tensor, Tensor, Tensor]:

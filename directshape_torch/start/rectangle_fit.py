@@ -40,7 +40,7 @@ class InstancePoints(NamedTuple):
     weight: Tensor  # (M, P) weights, which sum up to 1 for each instance; 0 for places without a point
     middle: Tensor  # (M, 2) median of the points
     outline: Tensor  # (M, 2) x / z of the first and the last column of the mask
-    is_outline_known: Tensor  # (M, 2) bool, false where the border of the image cuts the mask off
+    is_end_seen: Tensor  # (M, 2) bool, false where the border of the image or a nearer object cuts the mask off
 
 
 class Rectangles(NamedTuple):
@@ -59,6 +59,19 @@ def fit_rectangles(seen: InstancePoints) -> Rectangles:
     first = _improved(place, seen)
     _, kept = first.cost.nan_to_num(nan=math.inf).topk(_NUM_KEPT, dim=1, largest=False)
     return _improved(first.place.gather(1, kept[..., None].expand(-1, -1, place.shape[-1])), seen)
+
+
+def distance_outside(place: Tensor, xz: Tensor) -> Tensor:
+    """Distances (M, P) of points (M, P, 2) to rectangles (M, 5), metres; 0 within them and NaN for points of NaN."""
+    c, s = torch.cos(place[:, 2:3]), torch.sin(place[:, 2:3])
+    dx, dz = (xz - place[:, None, :2]).unbind(-1)
+    beyond = (torch.stack([c * dx - s * dz, s * dx + c * dz], dim=-1).abs() - 0.5 * place[:, None, 3:]).clamp_min(0)
+    return torch.hypot(beyond[..., 0], beyond[..., 1])
+
+
+def outline_of(place: Tensor) -> Tensor:
+    """x / z (..., 2) of the first and the last column of rectangles (..., 5) in the image."""
+    return _outer_corners(place)[0]
 
 
 def _improved(place: Tensor, seen: InstancePoints) -> Rectangles:
@@ -126,6 +139,28 @@ def _point_rows(place: Tensor, seen: InstancePoints) -> tuple[Tensor, Tensor, Te
 
 def _outline_rows(place: Tensor, seen: InstancePoints) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Rows of the distances, metres, by which the outer corners miss the first and last columns of the mask."""
+    column, depth, dx, dz, along, across = _outer_corners(place)
+    c, s = torch.cos(place[..., 2:3]), torch.sin(place[..., 2:3])
+    by = (1.0, -column, dz + column * dx, (c + column * s) * along, (s - column * c) * across)
+    # A difference of columns counts in metres at the depth of the points.
+    scale = seen.middle[..., 1:]
+    J = torch.stack([scale * each / depth for each in by], dim=-1)
+    off = column - seen.outline
+    # Where no end is seen, the car may go on beyond the mask, but does not end within it.
+    counts = seen.is_end_seen | (off * off.new_tensor((1.0, -1.0)) > 0)
+    off = torch.where(counts, scale * off, 0.0)
+    share = (off / _OUTLINE_SCALE_M).square()
+    cost = _OUTLINE_WEIGHT * _OUTLINE_SCALE_M**2 * (share / (1 + share)).sum(-1)
+    weight = torch.where(counts, _OUTLINE_WEIGHT / (1 + share).square(), 0.0)
+    return off, J, weight, cost
+
+
+def _outer_corners(place: Tensor) -> tuple[Tensor, ...]:
+    """The first and the last corner (..., 2) in the image of rectangles (..., 5).
+
+    Of each are returned x / z, z, x and z from the centre, metres, and its place along and across the car, in lengths
+    and widths.
+    """
     ends = place.new_tensor([(i * a, k * b) for a, b in _OCTAGON for i in (1, -1) for k in (1, -1)])
     x, z, heading = (each[..., None] for each in place[..., :3].unbind(-1))
     c, s = torch.cos(heading), torch.sin(heading)
@@ -134,17 +169,7 @@ def _outline_rows(place: Tensor, seen: InstancePoints) -> tuple[Tensor, Tensor, 
     depth = (z + dz).clamp_min(0.5)
     column = (x + dx) / depth
     outer = torch.stack([column.argmin(-1), column.argmax(-1)], dim=-1)
-    column, depth, dx, dz = (each.gather(-1, outer) for each in (column, depth, dx, dz))
-    a, b = (each[outer] for each in ends.unbind(-1))
-    by = (1.0, -column, dz + column * dx, (c + column * s) * a, (s - column * c) * b)
-    # A difference of columns counts in metres at the depth of the points.
-    scale = seen.middle[..., 1:]
-    J = torch.stack([scale * each / depth for each in by], dim=-1)
-    off = torch.where(seen.is_outline_known, scale * (column - seen.outline), 0.0)
-    share = (off / _OUTLINE_SCALE_M).square()
-    cost = _OUTLINE_WEIGHT * _OUTLINE_SCALE_M**2 * (share / (1 + share)).sum(-1)
-    weight = torch.where(seen.is_outline_known, _OUTLINE_WEIGHT / (1 + share).square(), 0.0)
-    return off, J, weight, cost
+    return *(each.gather(-1, outer) for each in (column, depth, dx, dz)), *(each[outer] for each in ends.unbind(-1))
 
 
 def _size_rows(place: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -5,34 +5,18 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 
 import pytest
 import torch
+from helpers.demo_masks import demo, started
 from torch import Tensor
 
-import directshape_torch
-from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, InputError, MaskCrops, Status
+from directshape_torch import Detections, DirectShapeRefiner, InputError, Status
 from directshape_torch.geometry.box3d import rotation_y_from_pose
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.frame_collation import collate
-from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
-from directshape_torch.stereo_matching.disparity import with_disparity
-
-DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
-
-
-@lru_cache(maxsize=1)
-def demo() -> LoadedFrame:
-    """The six cars with their true boxes, and frames that have been matched."""
-    loaded = open_dataset("kitti", DEMO, DEMO / "training" / "label_2", DEMO / "training" / "masks").load("000000")
-    return replace(loaded, frame=with_disparity(loaded.frame))
-
-
-def started(masks: MaskCrops | Tensor | None = None, frames: FrameBatch | None = None) -> Detections:
-    loaded = demo()
-    return Detections.from_masks(frames or loaded.frame, loaded.detections.mask_left if masks is None else masks)
+from directshape_torch.io.stereo_dataset import open_dataset
 
 
 def axis_error_deg(detections: Detections, truth: Detections) -> Tensor:

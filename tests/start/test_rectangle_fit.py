@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.start import rectangle_fit
-from directshape_torch.start.rectangle_fit import InstancePoints, fit_rectangles
+from directshape_torch.start.rectangle_fit import InstancePoints, distance_outside, fit_rectangles, outline_of
 
 CARS = torch.tensor(
     [[-3.0, 14.0, 0.3, 3.9, 1.6], [0.5, 20.0, -1.5, 4.4, 1.7], [6.0, 12.0, 1.2, 3.5, 1.65], [2.0, 9.0, 3.0, 4.0, 1.6]],
@@ -53,11 +53,27 @@ def test_finds_rectangles_again() -> None:
 
 def test_a_cut_outline_does_not_count() -> None:
     seen = seen_sides(CARS)
-    cut = seen._replace(
-        outline=seen.outline + torch.tensor([0.3, 0.0]), is_outline_known=torch.tensor([[False, True]] * 4)
-    )
+    cut = seen._replace(outline=seen.outline + torch.tensor([0.3, 0.0]), is_end_seen=torch.tensor([[False, True]] * 4))
     torch.testing.assert_close(best(cut)[0][:, :2], CARS[:, :2], rtol=0, atol=0.2)
-    assert (best(cut._replace(is_outline_known=seen.is_outline_known))[1] > best(cut)[1] + 0.05).all()
+    assert (best(cut._replace(is_end_seen=seen.is_end_seen))[1] > best(cut)[1] + 0.05).all()
+
+
+def test_a_car_does_not_end_within_a_mask_that_something_cuts_off() -> None:
+    seen = seen_sides(CARS)
+    wider = seen._replace(outline=seen.outline - torch.tensor([0.02, 0.0]))
+    unseen = wider._replace(is_end_seen=torch.tensor([[False, True]] * 4))
+    for told, untold in zip(best(wider), best(unseen), strict=True):
+        torch.testing.assert_close(told, untold)
+
+
+def test_points_and_columns_beside_a_rectangle_are_told() -> None:
+    seen = seen_sides(CARS)
+    assert distance_outside(CARS, seen.xz).max() < 1e-9
+    away = CARS[:, None, :2] * torch.tensor([[2.0], [math.nan]])
+    distances = distance_outside(CARS, away)
+    assert (distances[:, 0] - CARS[:, :2].norm(dim=1)).abs().max() < 2.5
+    assert distances[:, 1].isnan().all()
+    torch.testing.assert_close(outline_of(CARS), seen.outline)
 
 
 def test_stray_points_hardly_matter() -> None:
