@@ -145,8 +145,8 @@ class DirectShapeRefiner(nn.Module):
             full_precision(),
             compiling(self.config.compile),
         ):
-            result = self._refine(frames, detections, term_weights, noise)
-            return result if noise is None else fused(result, detections)
+            result, started = self._refine(frames, detections, term_weights, noise)
+            return result if noise is None else fused(result, started)
 
     @property
     def weighs_detector(self) -> bool:
@@ -207,7 +207,8 @@ class DirectShapeRefiner(nn.Module):
         detections: Detections,
         term_weights: Mapping[str, Tensor] | None,
         detector_noise: Tensor | None,
-    ) -> RefinementResult:
+    ) -> tuple[RefinementResult, Detections]:
+        """The result, and the detections with the poses that it started from."""
         seen = self._observe(frames, detections)
         cars = replace(self._cars(frames, detections), detector_noise=detector_noise)
         failure = refusals(cars, seen, self.config)
@@ -218,12 +219,21 @@ class DirectShapeRefiner(nn.Module):
         )
         unrefined = unrefined_result(self.prior, frames, detections, failure, problem.term_names)
         if not len(rows):
-            return unrefined
+            return unrefined, detections
         initial = self._input_state(detections.T_cam_obj.index_select(0, rows), cars)
-        if len(rows) == len(unrefined):
-            return self._minimise(problem, initial, cars, unrefined)
-        found = self._minimise(problem, initial, cars, unrefined.rows(rows))
-        return replace(unrefined.put(rows, found), term_names=found.term_names)
+        is_all, others = len(rows) == len(unrefined), detections.other_T_cam_obj
+        beforehand = unrefined if is_all else unrefined.rows(rows)
+        if others is None or cars.track_id is not None:
+            found = self._minimise(problem, initial, cars, beforehand)
+        else:
+            # The import stands here, because only cars with several poses need it.
+            from directshape_torch.refinement.candidates import refined_from_candidates
+
+            own = others.index_select(0, rows)
+            found, T_cam_obj = refined_from_candidates(problem, cars, initial, own, beforehand)
+            detections = replace(detections, T_cam_obj=detections.T_cam_obj.index_copy(0, rows, T_cam_obj))
+        result = found if is_all else replace(unrefined.put(rows, found), term_names=found.term_names)
+        return result, detections
 
     @full_precision()
     def problem(

@@ -42,10 +42,11 @@ def collate(loaded: Sequence[LoadedFrame]) -> tuple[FrameBatch, Detections]:
     batch = FrameBatch.joined(_alike(frames, size_hw))
     optional = ("pose_sigma", "offset_sigma_px", "track_id", "is_from_masks")
     known = {name for name in optional if any(getattr(part, name) is not None for part in cars)}
+    most = max(0 if part.other_T_cam_obj is None else part.other_T_cam_obj.shape[1] for part in cars)
     sequences = list(dict.fromkeys(item.sequence for item in loaded))
     places = [sequences.index(item.sequence) for item in loaded]
     parts = [
-        _numbered(_filled(part, known, size_hw), number, place, len(sequences))
+        _numbered(_filled(part, known, size_hw, most), number, place, len(sequences))
         for number, (part, place) in enumerate(zip(cars, places, strict=True))
     ]
     return batch, Detections.joined(parts)
@@ -95,8 +96,13 @@ def _alike(frames: Sequence[FrameBatch], size_hw: Size) -> list[FrameBatch]:
     return alike
 
 
-def _filled(d: Detections, known: set[str], size_hw: Size) -> Detections:
-    """Detections with padded masks, with occluders, and with neutral values for tensors that only other frames have."""
+def _filled(d: Detections, known: set[str], size_hw: Size, most_others: int) -> Detections:
+    """Detections with padded masks, with occluders, and with neutral values for tensors that only other frames have.
+
+    Every car gets as many other poses as the car that has most of them.
+    """
+    others = d.T_cam_obj.new_zeros(len(d), 0, 4, 4) if d.other_T_cam_obj is None else d.other_T_cam_obj
+    others = pad(others, (0, 0, 0, 0, 0, most_others - others.shape[1]), value=torch.nan)
     nothing: dict[str, Any] = {
         "pose_sigma": d.T_cam_obj.new_full((len(d), 4), torch.inf),
         "offset_sigma_px": torch.zeros_like(d.T_cam_obj[:, 0, 0]),
@@ -112,6 +118,7 @@ def _filled(d: Detections, known: set[str], size_hw: Size) -> Detections:
         occluders=replace(
             hidden, mask_left=hidden.mask_left.padded(size_hw), mask_right=hidden.mask_right.padded(size_hw)
         ),
+        other_T_cam_obj=others if most_others else None,
         **{name: nothing[name] for name in known if getattr(d, name) is None},
     )
 

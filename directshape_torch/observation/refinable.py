@@ -122,18 +122,22 @@ def _check_times(detections: Detections, frames: FrameBatch) -> None:
         seen.add(view)
 
 
+def stands_in_view(T_cam_obj: Tensor, ground_normal_cam: Tensor) -> Tensor:
+    """Whether poses (B, 4, 4) are finite, before the camera and not upside down on the ground (B, 3)."""
+    finite = T_cam_obj.isfinite().flatten(1).all(dim=1)
+    return finite & (T_cam_obj[:, 2, 3] > _MIN_DEPTH_M) & ((T_cam_obj[:, :3, 1] * ground_normal_cam).sum(-1) < 0)
+
+
 def refusals(cars: CarBatch, seen: Observation, config: RefinerConfig) -> Tensor:
     """The code (B,) of the status that forbids the refinement of each car, or -1."""
     T = cars.detector_T_cam_obj
-    finite = T.isfinite().all(-1).all(-1)
-    upright = (T[:, :3, 1] * cars.ground_normal_cam).sum(-1) < 0
-    in_front = finite & (T[:, 2, 3] > _MIN_DEPTH_M) & upright
+    finite, in_view = T.isfinite().flatten(1).all(dim=1), stands_in_view(T, cars.ground_normal_cam)
     if seen.points is not None and not config.fits_images:
         lacking = [(seen.points.counts < config.point_cloud.min_points, Status.too_few_points)]
     else:
         lacking = _lacking_pixels(seen, config.sampling.min_usable_pixels)
     code = torch.full((len(cars),), -1, device=T.device)
-    lacking += [(~in_front, Status.behind_camera), (~finite, Status.non_finite)]
+    lacking += [(~in_view, Status.behind_camera), (~finite, Status.non_finite)]
     if cars.is_from_masks is not None:
         without, has_mask = ~finite & cars.is_from_masks, seen.mask_areas[:, 0] > 0
         lacking += [(without & has_mask, Status.no_start), (without & ~has_mask, Status.no_mask)]

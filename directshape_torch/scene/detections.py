@@ -76,6 +76,10 @@ class Detections(TensorRecord):
         is_from_masks: (B,) bool, boxes that were made of the images' own disparities (`from_masks`) and not by a
             detector. They are no evidence of the rig or of a detector, and results are not compared with them. None
             means that a detector made every box; when collated with frames that have values, False replaces None.
+        other_T_cam_obj: (B, C, 4, 4) further poses that each car may have, such as other hypotheses of a detector or
+            the opposite heading; NaN where a car has fewer. The refinement tries them all, on the pixels of
+            `T_cam_obj`, and goes on from the one that explains the images best (docs/no_boxes.md). None means that
+            there are none; when collated with frames that have values, NaN replaces None.
 
     Raises:
         InputError: wrong shapes or types, a matrix that is no rotation, dimensions or standard deviations that are not
@@ -99,6 +103,7 @@ class Detections(TensorRecord):
     track_id: Annotated[Tensor | None, Dense("B", kind="index")] = None
     convention: BoxFormat = "kitti"
     is_from_masks: Annotated[Tensor | None, Dense("B", kind="flags")] = None
+    other_T_cam_obj: Annotated[Tensor | None, Dense("B", "C", 4, 4)] = None
 
     def __post_init__(self) -> None:
         _cut_masks(self)
@@ -106,8 +111,7 @@ class Detections(TensorRecord):
         _check_mask_numbers(self.mask_left, self.mask_right, len(self.frame_index))
         form = box_form(self.convention)
         check_type("occluders", self.occluders, (Occluders, NoneType))
-        has_pose = self.T_cam_obj.isfinite().flatten(1).all(dim=1)
-        T_known = torch.where(has_pose[:, None, None], self.T_cam_obj, torch.eye(4).to(self.T_cam_obj))
+        T_known = _known_poses(self.T_cam_obj)
         # One wait for the device serves both checks. NaN dimensions pass here, and fail their own car.
         if bool((is_no_rotation(T_known) | (self.dimensions_hwl <= 0).any(dim=1).to(T_known.device)).any()):
             check_rotation("T_cam_obj", T_known)
@@ -115,6 +119,9 @@ class Detections(TensorRecord):
             cure = f"leave out objects without a 3D box; sizes of {self.convention!r} boxes are {form.order}"
             unfit = (self.dimensions_hwl <= 0).any(dim=1)
             check_rows("dimensions_hwl", unfit, self.dimensions_hwl, expected, cure)
+        if self.other_T_cam_obj is not None:
+            for number, T_other in enumerate(self.other_T_cam_obj.unbind(dim=1)):
+                check_rotation(f"other_T_cam_obj[:, {number}]", _known_poses(T_other))
         if self.pose_sigma is not None:
             cure = "give infinity for what the detector does not know"
             unfit = (~(self.pose_sigma.detach() > 0)).any(dim=1)
@@ -220,10 +227,10 @@ class Detections(TensorRecord):
         """Detections of instance masks alone: rough boxes are made of the disparity under each left mask.
 
         A mean car's rectangle is fitted to the stereo points of each mask, seen from above, from all headings. The
-        ground plane gives the height. Which end of a car is its front is not known from this: the heading is known
-        modulo half a turn, and each car is taken to be seen from behind, as most are. A mask that shows too
-        little disparity, nothing of a car's size on the road, or more than one car, gets a pose of NaN and, from a
-        refiner, the status `no_start`.
+        ground plane gives the height. Which end of a car is its front is not known from this: `T_cam_obj` has each car
+        seen from behind, and `other_T_cam_obj` has the opposite heading and, where another rectangle fits as well, both
+        headings of that. A mask that shows too little disparity, nothing of a car's size on the road, or more than one
+        car, gets a pose of NaN and, from a refiner, the status `no_start`.
 
         The boxes are made of the same disparities that a rig would be checked with, so they are no evidence of it
         (`is_from_masks`): frames need a camera whose disparity is right, or a known `disparity_field`, such as
@@ -291,6 +298,12 @@ def _cut_masks(instances: Detections | Occluders) -> None:
     """Replace the masks of a record by crops where they came in another form."""
     for name in ("mask_left", "mask_right"):
         object.__setattr__(instances, name, MaskCrops.of(getattr(instances, name), name=name))
+
+
+def _known_poses(T: Tensor) -> Tensor:
+    """Poses (B, 4, 4) with the identity in the place of those that are not finite."""
+    is_known = T.isfinite().flatten(1).all(dim=1)
+    return torch.where(is_known[:, None, None], T, torch.eye(4).to(T))
 
 
 def _check_mask_numbers(left: MaskCrops, right: MaskCrops, count: int) -> None:

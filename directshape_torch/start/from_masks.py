@@ -33,6 +33,8 @@ _MIDDLE_M, _SPREAD_M = (-0.5, 2.0), (0.08, 1.0)
 _BESIDE_SHARE, _BESIDE_M, _BEYOND_M = 0.3, 0.5, 0.4
 # The fit of a car has at most this robust cost, square metres.
 _LARGEST_COST = 0.12
+# Two rectangles are different starts if they differ by more than this in their axes or places.
+_OTHER_TURN_RAD, _OTHER_PLACE_M = math.radians(15), 0.7
 # This many instances are fitted at once, which limits the memory.
 _PORTION = 64
 
@@ -52,23 +54,24 @@ def start_boxes(
     under = points_under(frames, mask_left, frame_index)
     seen = _near_each_other(under)
     above = height_above_ground(seen.points_cam, frames, frame_index)
-    place, cost = _placed(frames, mask_left, frame_index, seen, above)
+    places, costs = _placed(frames, mask_left, frame_index, seen, above)
+    place, cost = places[:, 0], costs[:, 0]
     is_car = _looks_like_a_car(frames, mask_left, frame_index, seen, above, place, cost)
     is_car = is_car & _is_one_car(frames, mask_left, frame_index, under.points_cam, place)
-    x, z, heading, length, width = place.unbind(-1)
-    normal, offset = (each[frame_index] for each in (frames.ground.normal, frames.ground.offset))
-    y = -(normal[:, 0] * x + normal[:, 2] * z + offset) / normal[:, 1]
-    T_cam_obj = pose_from_kitti(torch.stack([x, y, z], dim=-1), _facing(x, z, heading))
+    length, width = place[:, 3:].unbind(-1)
+    T_cam_obj = _both_senses(frames, frame_index, torch.stack([place, _another(places)], dim=1))
+    T_cam_obj = torch.where(is_car[:, None, None, None], T_cam_obj, torch.nan)
     hwl = torch.stack([torch.full_like(length, MEAN_HWL[0]), width, length], dim=-1)
     return Detections(
         frame_index=frame_index,
-        T_cam_obj=torch.where(is_car[:, None, None], T_cam_obj, torch.nan),
+        T_cam_obj=T_cam_obj[:, 0],
         dimensions_hwl=torch.where(is_car[:, None], hwl, torch.nan),
         box_2d=mask_left.box_2d.to(place),
         score=score,
         mask_left=mask_left,
         mask_right=mask_right,
         is_from_masks=torch.ones_like(is_car),
+        other_T_cam_obj=T_cam_obj[:, 1:],
     )
 
 
@@ -87,7 +90,7 @@ def _near_each_other(seen: MaskPoints) -> MaskPoints:
 def _placed(
     frames: FrameBatch, masks: MaskCrops, frame_index: Tensor, seen: MaskPoints, above: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The rectangle (M, 5) of lowest cost of each instance, and this cost (M,)."""
+    """The rectangles (M, C, 5) of each instance, from the lowest cost on, and these costs (M, C)."""
     xz = seen.points_cam[..., 0::2]
     on_band = (above > _BAND_M[0]) & (above < _BAND_M[1])
     weight = torch.where(on_band, torch.ones_like(above), _OFF_BAND_WEIGHT) * above.isfinite()
@@ -98,13 +101,32 @@ def _placed(
         outline=_outline(frames, masks, frame_index),
         is_end_seen=ends_seen(frames, masks, frame_index, seen.points_cam),
     )
-    best, costs = [of_instances.xz.new_zeros(0, 5)], [xz.new_zeros(0)]
+    fits = [fit_rectangles(InstancePoints(*(each[:0] for each in of_instances)))]
     for first in range(0, len(xz), _PORTION):
-        fitted = fit_rectangles(InstancePoints(*(each[first : first + _PORTION] for each in of_instances)))
-        cost, chosen = fitted.cost.nan_to_num(nan=math.inf).min(dim=1)
-        best.append(fitted.place.gather(1, chosen[:, None, None].expand(-1, 1, 5))[:, 0])
-        costs.append(cost)
-    return torch.cat(best), torch.cat(costs)
+        fits.append(fit_rectangles(InstancePoints(*(each[first : first + _PORTION] for each in of_instances))))
+    place, cost = (torch.cat(column) for column in zip(*fits, strict=True))
+    cost, order = cost.nan_to_num(nan=math.inf).sort(dim=1, stable=True)
+    return place.gather(1, order[..., None].expand_as(place)), cost
+
+
+def _another(places: Tensor) -> Tensor:
+    """Of rectangles (M, C, 5), from the lowest cost on, the first (M, 5) that differs from the best, or NaN."""
+    off = places - places[:, :1]
+    turned = torch.remainder(off[..., 2] + 0.5 * math.pi, math.pi) - 0.5 * math.pi
+    differs = (turned.abs() > _OTHER_TURN_RAD) | (off[..., :2].norm(dim=-1) > _OTHER_PLACE_M)
+    first = differs.to(torch.int8).argmax(dim=1)
+    found = places.gather(1, first[:, None, None].expand(-1, 1, 5))[:, 0]
+    return torch.where(differs.any(dim=1, keepdim=True), found, torch.nan)
+
+
+def _both_senses(frames: FrameBatch, frame_index: Tensor, place: Tensor) -> Tensor:
+    """Poses (M, 2 N, 4, 4) of cars on the road with rectangles (M, N, 5), each facing away and then opposite."""
+    x, z, heading = place[..., :3].unbind(-1)
+    normal, offset = (each[frame_index, None] for each in (frames.ground.normal, frames.ground.offset))
+    y = -(normal[..., 0] * x + normal[..., 2] * z + offset) / normal[..., 1]
+    away = _facing(x, z, heading)
+    location = torch.stack([x, y, z], dim=-1)[:, :, None].expand(-1, -1, 2, -1)
+    return pose_from_kitti(location, torch.stack([away, wrap_angle(away + math.pi)], dim=-1)).flatten(1, 2)
 
 
 def _outline(frames: FrameBatch, masks: MaskCrops, frame_index: Tensor) -> Tensor:

@@ -237,6 +237,19 @@ def test_collate_keeps_standard_deviations_and_what_no_frame_knows_is_infinite(r
     assert collate([loaded, loaded])[1].pose_sigma is None
 
 
+def test_collate_gives_every_car_as_many_other_poses_as_the_one_with_most(root: Path) -> None:
+    loaded = dataset(root).load("000000")
+    poses = loaded.detections.T_cam_obj[:, None]
+    one, two = (
+        replace(loaded, detections=replace(loaded.detections, other_T_cam_obj=poses.repeat(1, n, 1, 1))) for n in (1, 2)
+    )
+    joined = collate([one, loaded, two])[1].other_T_cam_obj
+    count = len(poses)
+    assert joined.isfinite().flatten(2).all(dim=2).sum(dim=1).tolist() == [*[1] * count, *[0] * count, *[2] * count]
+    assert torch.equal(joined[-count:, 1], poses[:, 0])
+    assert collate([loaded, loaded])[1].other_T_cam_obj is None
+
+
 def test_collate_compares_all_of_the_fields(root: Path) -> None:
     camera = dataset(root).load("000000").frame.camera
     field = DisparityField.constant(-0.5, (160, 120), camera.K_left[0], camera.K_right[0], camera.T_right_cam[0])
