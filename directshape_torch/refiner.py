@@ -209,6 +209,8 @@ class DirectShapeRefiner(nn.Module):
         detector_noise: Tensor | None,
     ) -> tuple[RefinementResult, Detections]:
         """The result, and the detections with the poses that it started from."""
+        if detections.track_id is not None and detections.other_T_cam_obj is not None:
+            return self._refine_facing_one_way(frames, detections, term_weights, detector_noise)
         seen = self._observe(frames, detections)
         cars = replace(self._cars(frames, detections), detector_noise=detector_noise)
         failure = refusals(cars, seen, self.config)
@@ -223,7 +225,7 @@ class DirectShapeRefiner(nn.Module):
         initial = self._input_state(detections.T_cam_obj.index_select(0, rows), cars)
         is_all, others = len(rows) == len(unrefined), detections.other_T_cam_obj
         beforehand = unrefined if is_all else unrefined.rows(rows)
-        if others is None or cars.track_id is not None:
+        if others is None:
             found = self._minimise(problem, initial, cars, beforehand)
         else:
             # The import stands here, because only cars with several poses need it.
@@ -234,6 +236,28 @@ class DirectShapeRefiner(nn.Module):
             detections = replace(detections, T_cam_obj=detections.T_cam_obj.index_copy(0, rows, T_cam_obj))
         result = found if is_all else replace(unrefined.put(rows, found), term_names=found.term_names)
         return result, detections
+
+    def _refine_facing_one_way(
+        self,
+        frames: FrameBatch,
+        detections: Detections,
+        term_weights: Mapping[str, Tensor] | None,
+        detector_noise: Tensor | None,
+    ) -> tuple[RefinementResult, Detections]:
+        """Refine cars that have tracks and several poses: each is first refined alone to choose its pose."""
+        # The import stands here, because only such cars need it.
+        from directshape_torch.start.driving_direction import facing_one_way
+
+        assert detections.other_T_cam_obj is not None
+        has_others = detections.other_T_cam_obj.isfinite().flatten(1).any(dim=1)
+        with torch.no_grad():
+            by_itself = replace(detections, track_id=None)
+            alone, started = self._refine(frames, by_itself, term_weights, detector_noise)
+            of_front = alone.quality.probability_heading
+        started = replace(started, track_id=detections.track_id, other_T_cam_obj=None)
+        started, of_front = facing_one_way(frames, started, has_others, of_front)
+        result, started = self._refine(frames, started, term_weights, detector_noise)
+        return replace(result, quality=replace(result.quality, probability_heading=of_front)), started
 
     @full_precision()
     def problem(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ import directshape_torch
 from directshape_torch import Detections, DirectShapeRefiner, load_config
 from directshape_torch.geometry.box3d import rotation_y_from_pose
 from directshape_torch.geometry.se3 import exp
+from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
 from directshape_torch.refinement.candidates import probability_of_sense
 from directshape_torch.refinement.result import RefinementResult
@@ -122,9 +124,13 @@ def test_the_box_of_the_chosen_pose_is_compared_and_combined(demo: LoadedFrame, 
     torch.testing.assert_close(found.T_cam_obj, alone.T_cam_obj, rtol=0, atol=0.1)
 
 
-def test_views_of_tracks_keep_their_first_pose(demo: LoadedFrame, cars: Detections) -> None:
-    by_itself = replace(cars, track_id=torch.tensor([-1, -1, -1]))
-    assert_equal(refined(demo, with_others(by_itself, turned(cars.T_cam_obj, 180))), refined(demo, by_itself))
+def test_cars_outside_of_tracks_choose_as_in_a_call_without_tracks(demo: LoadedFrame, cars: Detections) -> None:
+    several = with_others(cars, turned(cars.T_cam_obj, 180))
+    by_itself = replace(several, track_id=torch.tensor([-1, -1, -1]))
+    found, expected = refined(demo, by_itself), refined(demo, several)
+    for name in ("T_cam_obj", "code", "status_code", "covariance", "quality.probability_heading"):
+        (of_found, of_expected) = (attrgetter(name)(result) for result in (found, expected))
+        torch.testing.assert_close(of_found, of_expected, rtol=0, atol=0, equal_nan=True)
 
 
 @pytest.mark.parametrize("mode", ["unroll", "implicit"])
@@ -160,3 +166,20 @@ def test_who_costs_as_much_in_both_senses_has_an_even_chance() -> None:
     assert 0.9 < likely < 1
     assert unlikely == pytest.approx(1 - likely)
     assert probability_of_sense(cost[:1], forward[:1], torch.tensor([2])).isnan().all()
+
+
+def test_views_of_a_track_agree_on_the_front(demo: LoadedFrame, cars: Detections) -> None:
+    """The same frame is there twice; in the second view the start faces the other way."""
+    frames, twice = collate([replace(demo, detections=cars), replace(demo, detections=cars)])
+    count = len(cars)
+    start = twice.T_cam_obj.clone()
+    start[count:] = turned(start[count:], 180)
+    views = replace(twice, T_cam_obj=start, track_id=torch.arange(count).repeat(2))
+    config = load_config(None, ["compile=off", "check=off"])
+    with torch.no_grad():
+        found = DirectShapeRefiner(config=config)(frames, with_others(views, turned(start, 180)))
+    assert found.refined.all()
+    assert (heading_error_deg(found, twice) < 5).all()
+    assert torch.equal(found.code[:count], found.code[count:])
+    assert torch.equal(found.quality.probability_heading[:count], found.quality.probability_heading[count:])
+    assert (found.quality.probability_heading > 0.7).all()

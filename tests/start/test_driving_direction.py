@@ -1,4 +1,4 @@
-"""The way that a tracked car drives tells its front, where its boxes were made of masks."""
+"""All views of a tracked car, and the way that it drives, tell its front."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from torch import Tensor
 
 from directshape_torch import Detections, FrameBatch, StereoCamera
 from directshape_torch.geometry.box3d import rotation_y_from_pose
-from directshape_torch.start.driving_direction import along_motion
+from directshape_torch.start.driving_direction import facing_one_way
 
 SPEED_M = 1.0  # from frame to frame
 
 
 def scene(headings: Tensor, steps_m: float, has_poses: bool = True) -> tuple[FrameBatch, Detections]:
-    """A car that drives along the headings while the camera drives 0.5 m a frame, with boxes of masks."""
+    """A car that drives along the headings while the camera drives 0.5 m a frame, with true boxes."""
     count = len(headings)
     K = torch.tensor([[700.0, 0.0, 200.0], [0.0, 700.0, 60.0], [0.0, 0.0, 1.0]])
     image = torch.zeros(count, 3, 120, 400)
@@ -31,49 +31,57 @@ def scene(headings: Tensor, steps_m: float, has_poses: bool = True) -> tuple[Fra
     boxes[:, [0, 2]], boxes[:, 6] = xz, headings
     detections = Detections.from_boxes(boxes, mask_left=torch.ones(count, 120, 400), frame_index=torch.arange(count))
     track_id = torch.zeros(count, dtype=torch.long)
-    return frames, replace(detections, track_id=track_id, is_from_masks=torch.ones(count, dtype=torch.bool))
+    return frames, replace(detections, track_id=track_id)
 
 
 def headings_of(detections: Detections) -> Tensor:
     return rotation_y_from_pose(detections.T_cam_obj)
 
 
-@pytest.mark.parametrize("turned", [[False] * 6, [True] * 6, [True, False, False, True, True, False]])
-def test_a_turning_car_faces_the_way_that_it_drives(turned: list[bool]) -> None:
+def turned(detections: Detections, rows: list[bool]) -> Detections:
+    T = detections.T_cam_obj.clone()
+    T[rows] = T[rows] @ torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    return replace(detections, T_cam_obj=T)
+
+
+def faced(frames: FrameBatch, detections: Detections, says: list[float]) -> tuple[Tensor, Tensor]:
+    """The headings of the cars, and the probability of their fronts."""
+    is_questioned = torch.ones(len(detections), dtype=torch.bool)
+    found, probability = facing_one_way(frames, detections, is_questioned, torch.tensor(says))
+    return headings_of(found), probability
+
+
+@pytest.mark.parametrize("rows", [[False] * 6, [True] * 6, [True, False, False, True, True, False]])
+def test_a_turning_car_faces_the_way_that_it_drives(rows: list[bool]) -> None:
     truth = torch.linspace(-1.2, 0.8, 6)
     frames, detections = scene(truth, SPEED_M)
-    wrong = detections.T_cam_obj.clone()
-    wrong[turned] = wrong[turned] @ torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
-    found, probability = along_motion(frames, replace(detections, T_cam_obj=wrong))
-    torch.testing.assert_close(headings_of(found), truth)
-    assert (probability > 0.95).all()
+    headings, probability = faced(frames, turned(detections, rows), [0.6] * 6)
+    torch.testing.assert_close(headings, truth)
+    assert (probability > 0.9).all()
 
 
-def test_a_parked_car_has_one_sense_that_nobody_knows() -> None:
+@pytest.mark.parametrize("has_poses", [True, False])
+def test_most_views_of_a_parked_car_decide(has_poses: bool) -> None:
     truth = torch.full((4,), 0.3)
-    frames, detections = scene(truth, 0.0)
-    wrong = detections.T_cam_obj.clone()
-    wrong[1] = wrong[1] @ torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
-    found, probability = along_motion(frames, replace(detections, T_cam_obj=wrong))
-    torch.testing.assert_close(headings_of(found), truth)
-    torch.testing.assert_close(probability, torch.full((4,), 0.5), rtol=0, atol=0.02)
+    frames, detections = scene(truth, 0.0, has_poses)
+    headings, probability = faced(frames, turned(detections, [False, True, False, False]), [0.8, 0.7, 0.8, math.nan])
+    torch.testing.assert_close(headings, truth)
+    expected = torch.sigmoid((2 * torch.logit(torch.tensor(0.8)) - torch.logit(torch.tensor(0.7))) / 4)
+    torch.testing.assert_close(probability, expected.expand(4), rtol=0, atol=0.02)
 
 
-def test_without_poses_of_the_camera_views_agree_and_nothing_is_known() -> None:
-    truth = torch.full((3,), math.pi / 2)
-    frames, detections = scene(truth, SPEED_M, has_poses=False)
-    found, probability = along_motion(frames, detections)
-    assert torch.equal(found.T_cam_obj, detections.T_cam_obj)
-    assert probability.isnan().all()
+def test_without_poses_of_the_camera_the_way_says_nothing() -> None:
+    frames, detections = scene(torch.full((3,), math.pi / 2), -SPEED_M, has_poses=False)
+    headings, probability = faced(frames, detections, [0.7, 0.7, 0.7])
+    torch.testing.assert_close(headings, headings_of(detections))
+    torch.testing.assert_close(probability, torch.full((3,), 0.7))
 
 
-def test_boxes_of_a_detector_and_cars_by_themselves_stay() -> None:
+def test_given_fronts_and_cars_by_themselves_stay() -> None:
     frames, detections = scene(torch.full((3,), -2.0), -SPEED_M)
-    for others in (
-        replace(detections, is_from_masks=None),
-        replace(detections, track_id=torch.full((3,), -1)),
-        replace(detections, track_id=None),
-    ):
-        found, probability = along_motion(frames, others)
+    says, questioned = torch.full((3,), 0.7), torch.ones(3, dtype=torch.bool)
+    alone = replace(detections, track_id=torch.full((3,), -1))
+    for given, is_questioned in ((detections, ~questioned), (alone, questioned)):
+        found, probability = facing_one_way(frames, given, is_questioned, says)
         assert torch.equal(found.T_cam_obj, detections.T_cam_obj)
-        assert probability.isnan().all()
+        assert torch.equal(probability, says)
