@@ -26,9 +26,12 @@ from directshape_torch.state.cars import CarBatch, CarState
 from directshape_torch.status import is_refined
 from directshape_torch.terms.photometric import PhotometricEvidence
 
-# The odds of the front are `(1 + d / scale)^exponent`, where d is the difference of the costs of both senses. They grow
-# slowly, because the shapes of some cars mislead strongly. scripts/calibrate_heading.py fits both numbers.
-SENSE_SCALE, SENSE_EXPONENT = 0.03, 0.81
+SENSE_SCALE = 0.057
+"""The odds of the cheaper sense of a heading are 1 plus the difference of the costs of both senses over this number.
+
+They grow slowly, because the shapes of some cars mislead strongly. scripts/calibrate_heading.py fits the number.
+"""
+
 # Two headings are the two senses of one axis where they are within 60 degrees of opposite.
 _OPPOSITE_COSINE = -0.5
 
@@ -131,7 +134,7 @@ def probability_of_sense(
     Examples:
         >>> forward = torch.tensor([[[1.0, 0, 0], [-1.0, 0, 0]]])
         >>> probability_of_sense(torch.tensor([[2.0, 2.5]]), forward, torch.tensor([0]))
-        tensor([0.9138])
+        tensor([0.9072])
         >>> probability_of_sense(torch.tensor([[2.0, torch.inf]]), forward, torch.tensor([0]))
         tensor([nan])
     """
@@ -139,5 +142,5 @@ def probability_of_sense(
     is_opposite = (forward_cam * at_best).sum(dim=-1) < _OPPOSITE_COSINE
     opposite = cost.masked_fill(~is_opposite, torch.inf).amin(dim=1)
     more = opposite - cost.gather(1, best[:, None])[:, 0]
-    log_odds = SENSE_EXPONENT * more.sign() * (more.abs() / SENSE_SCALE).log1p()
-    return torch.where(opposite.isfinite(), 1 / (1 + torch.exp(-log_odds)), torch.nan)
+    of_dearer = 1 / (2 + more.abs() / SENSE_SCALE)
+    return torch.where(opposite.isfinite(), torch.where(more < 0, of_dearer, 1 - of_dearer), torch.nan)
