@@ -47,12 +47,12 @@ def refined_from_candidates(
 
     The result of the lowest cost is the best one; a result that is refused is worse than any that is not.
     """
-    poses = torch.cat([cars.detector_T_cam_obj[:, None], other_T_cam_obj], dim=1)
-    in_view = torch.stack([stands_in_view(T, cars.ground_normal_cam) for T in poses.unbind(dim=1)], dim=1)
-    poses, in_view = (each[:, in_view.any(dim=0)] for each in (poses, in_view))
+    T_cam_obj = torch.cat([cars.detector_T_cam_obj[:, None], other_T_cam_obj], dim=1)
+    in_view = torch.stack([stands_in_view(T, cars.ground_normal_cam) for T in T_cam_obj.unbind(dim=1)], dim=1)
+    T_cam_obj, in_view = (each[:, in_view.any(dim=0)] for each in (T_cam_obj, in_view))
     tries = [
-        _Try.of(problem, cars, initial, T_cam_obj, Chosen.where(has_pose), unrefined)
-        for T_cam_obj, has_pose in zip(poses.unbind(dim=1), in_view.unbind(dim=1), strict=True)
+        _Try.of(problem, cars, initial, T_start, Chosen.where(has_start), unrefined)
+        for T_start, has_start in zip(T_cam_obj.unbind(dim=1), in_view.unbind(dim=1), strict=True)
     ]
     cost, forward, refused = (torch.stack(column, dim=1) for column in zip(*map(_Try.of_all, tries), strict=True))
     only_refused = refused.all(dim=1, keepdim=True)
@@ -65,7 +65,7 @@ def refined_from_candidates(
         is_best = best[rows] == number
         own = each.result(is_best, sense[rows], width).rows(is_best.nonzero()[:, 0])
         result = result.put(rows[is_best], own)
-    return result, poses.gather(1, best[:, None, None, None].expand(-1, 1, 4, 4))[:, 0]
+    return result, T_cam_obj.gather(1, best[:, None, None, None].expand(-1, 1, 4, 4))[:, 0]
 
 
 class _Try(NamedTuple):
@@ -99,7 +99,8 @@ class _Try(NamedTuple):
         """
         minimum, names = self.refined.minimum, self.refined.problem.term_names
         compares = [number for number, name in enumerate(names) if name not in PhotometricEvidence.names]
-        cost = minimum.after.term_costs[:, compares].sum(dim=1).nan_to_num(nan=torch.inf)
+        cost = minimum.after.term_costs[:, compares].sum(dim=1)
+        cost = cost.masked_fill(cost.isnan(), torch.inf)
         of_all = cost.new_full(self.chosen.keep.shape, torch.inf).index_copy(0, self.chosen.index, cost)
         # The first row of R_obj_cam is the object's x axis in the camera's frame.
         x_axis = minimum.end.T_obj_cam[:, 0, :3]

@@ -46,6 +46,8 @@ def test_rotations_are_rotations(wrong: torch.Tensor) -> None:
         replace(scene.frames.camera, T_right_cam=T_right_cam)
     with pytest.raises(InputError, match=r"T_cam_obj: expected rotations R .* in row 1; leave scale out"):
         replace(scene.detections, T_cam_obj=T_cam_obj)
+    with pytest.raises(InputError, match=r"other_T_cam_obj\[:, 1\]: expected rotations R .* in row 1; leave scale out"):
+        replace(scene.detections, other_T_cam_obj=torch.stack([scene.detections.T_cam_obj, T_cam_obj], dim=1))
     T_cam_obj[0] = torch.nan  # rows without a pose count when the wrong one is named
     with pytest.raises(InputError, match=r"in row 1"):
         replace(scene.detections, T_cam_obj=T_cam_obj)
@@ -56,6 +58,8 @@ def test_poses_may_be_rounded_or_unknown() -> None:
     T_cam_obj = detections.T_cam_obj.float().double()
     T_cam_obj[0] = torch.nan
     assert len(replace(detections, T_cam_obj=T_cam_obj)) == 2
+    some = replace(detections, other_T_cam_obj=T_cam_obj[:, None])
+    assert some.rows(torch.tensor([1])).to(dtype=torch.float32).other_T_cam_obj.equal(T_cam_obj[1:, None].float())
 
 
 def test_images_of_0_to_255_are_refused_and_nan_is_not() -> None:
