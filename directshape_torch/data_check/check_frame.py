@@ -26,14 +26,7 @@ from directshape_torch.io.velodyne import lidar_pose, points_by_columns, read_po
 from directshape_torch.scene.detections import MOST_TELLING
 from directshape_torch.scene.frames import SIDES
 from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence, Pair, Scan, reread_boxes
-from directshape_torch.scene_check.check_images import (
-    SPOILS_CAMERA,
-    SPOILS_PAIR,
-    check_calibration,
-    check_images,
-    without_doubts,
-)
-from directshape_torch.scene_check.check_tones import check_tones
+from directshape_torch.scene_check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, with_images
 from directshape_torch.scene_check.finding import Finding, found, names, unreadable
 from directshape_torch.scene_check.words import Words, words_of_files
 
@@ -93,9 +86,7 @@ def check_frame(
     # A wrong calibration must not affect the checks of the images themselves.
     camera = None if names(findings) & SPOILS_CAMERA else camera
     if pair is not None:
-        findings += check_tones(*pair, attempt.where)
-        of_pair = check_images(*pair, camera, attempt.where) if match_images else []
-        findings = [*without_doubts(findings, of_pair), *of_pair]
+        findings = with_images(findings, pair, camera, attempt.where, match_images)
     cars = [o for o in objects or [] if o.type in dataset.classes and o.has_box_3d]
     if camera is None or size_hw is None:
         return findings, len(cars), None

@@ -9,25 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.scene_check.car_evidence import Pair
 from directshape_torch.scene_check.check_places import swapped
+from directshape_torch.scene_check.check_tones import check_tones
 from directshape_torch.scene_check.finding import Finding, Severity, found
 from directshape_torch.scene_check.words import Words
 
 # If one of these is wrong, disparities and projections are not informative.
 SPOILS_CAMERA = frozenset({"raw_intrinsics", "baseline_sign", "baseline_length", "focal_length", "principal_point"})
 SPOILS_PAIR = frozenset(
-    {
-        *(
-            "images_swapped",
-            "image_mirrored",
-            "same_image",
-            "different_scenes",
-            "not_rectified",
-            "few_matches",
-            "grey_levels",
-        ),
-        "raw_intrinsics",
-    }
+    {"images_swapped", "image_mirrored", "same_image", "different_scenes", "not_rectified", "few_matches"}
+    | {"grey_levels", "raw_intrinsics"}
 )
 # This is the range of lenses with 15 to 150 degrees of view across the image.
 FOCAL_SHARES = (0.13, 3.8)
@@ -112,16 +104,6 @@ def _check_alike(cameras: Mapping[str, NDArray[np.float64]], where: str) -> list
     return [found("raw_intrinsics", where, measured, severity=severity)]
 
 
-def without_doubts(of_numbers: Sequence[Finding], of_pair: Sequence[Finding]) -> list[Finding]:
-    """Findings from numbers without doubts about intrinsics that matches have settled."""
-    settled = not any(finding.check == "few_matches" for finding in of_pair)
-    return [
-        finding
-        for finding in of_numbers
-        if not (settled and finding.check == "raw_intrinsics" and finding.severity == "warning")
-    ]
-
-
 def _check_centre(centre: tuple[float, float], size_wh: tuple[int, int], where: str) -> list[Finding]:
     offset = max(abs(c / n - 0.5) for c, n in zip(centre, size_wh, strict=True))
     if offset <= CENTRE_SHARE_WARNING:
@@ -133,6 +115,19 @@ def _check_centre(centre: tuple[float, float], size_wh: tuple[int, int], where: 
     cure = f"K is of images {across:.2f} times as large: multiply fx, fy, cx and cy by {1 / across:.2f}"
     measured = f"({centre[0]:.1f}, {centre[1]:.1f}) in images of {size_wh[0]} x {size_wh[1]} pixels"
     return [found("principal_point", where, measured, severity=severity, cure=cure if resized else "")]
+
+
+def with_images(
+    of_numbers: Sequence[Finding], pair: Pair, camera: StereoCamera | None, where: str, match_images: bool
+) -> list[Finding]:
+    """Findings from numbers and those of two images, whose matches settle doubts about intrinsics."""
+    found = [*of_numbers, *check_tones(*pair, where)]
+    if not match_images:
+        return found
+    of_pair = check_images(*pair, camera, where)
+    if "few_matches" not in {finding.check for finding in of_pair}:
+        found = [one for one in found if (one.check, one.severity) != ("raw_intrinsics", "warning")]
+    return [*found, *of_pair]
 
 
 def check_images(

@@ -12,17 +12,10 @@ from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.scene_check.car_evidence import FrameEvidence, evidence_of_scene
 from directshape_torch.scene_check.check_boxes import check_box_2d, check_boxes, check_corners
-from directshape_torch.scene_check.check_images import (
-    SPOILS_CAMERA,
-    SPOILS_PAIR,
-    check_calibration,
-    check_images,
-    without_doubts,
-)
+from directshape_torch.scene_check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, with_images
 from directshape_torch.scene_check.check_lidar import check_lidar
 from directshape_torch.scene_check.check_masks import check_masks
 from directshape_torch.scene_check.check_places import check_distances, check_heading, check_swapped, measure_cars
-from directshape_torch.scene_check.check_tones import check_tones
 from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, names
 from directshape_torch.scene_check.finding import found as found_mistake
 from directshape_torch.scene_check.words import Words
@@ -74,10 +67,8 @@ def check_scene(
     usable = not names(found) & SPOILS_CAMERA
     for one in evidence:
         if one.pair is not None:
-            found += check_tones(*one.pair, f"frame {one.frame_id}")
-        if match_images and one.pair is not None:
-            of_pair = check_images(*one.pair, one.camera if usable else None, f"frame {one.frame_id}")
-            found = [*without_doubts(found, of_pair), *of_pair]
+            camera = one.camera if usable else None
+            found = with_images(found, one.pair, camera, f"frame {one.frame_id}", match_images)
     found += _mask_sizes(frames, detections)
     if usable and not names(found) & {"mask_size"}:
         spoilt = bool(names(found) & SPOILS_PAIR)
