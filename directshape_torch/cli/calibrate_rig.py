@@ -1,10 +1,11 @@
 """`directshape calibrate-rig`: what a stereo rig's disparities and a detector's depths are off by.
 
 Estimate the errors of a stereo rig's disparities over the image, and of a detector's depths, for 'directshape refine
---rig FILE'. 'refine' does this by itself from detections (docs/your_rig.md); this command adds other evidence: LiDAR
-scans (training/velodyne), disparity maps (training/disp_noc_0 or disp_occ_0), or consecutive frames of a car that
-drives past still objects ('motion': ROOT is one sequence with image_02, image_03 and calib.txt, as in KITTI's tracking
-benchmark). Detections are taken from all frames, whether chosen or not. Evidence of all kinds, also of --rig, adds up.
+--rig FILE'. 'refine' does this by itself from detections, or without these from the sizes of cars under masks
+(docs/your_rig.md); this command adds other evidence: LiDAR scans (training/velodyne), disparity maps
+(training/disp_noc_0 or disp_occ_0), or consecutive frames of a car that drives past still objects ('motion': ROOT is
+one sequence with image_02, image_03 and calib.txt, as in KITTI's tracking benchmark). Detections and sizes are taken
+from all frames, whether chosen or not. Evidence of all kinds, also of --rig, adds up.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--from",
         dest="sources",
         nargs="+",
-        choices=("detections", "lidar", "disparity", "motion"),
+        choices=("detections", "sizes", "lidar", "disparity", "motion"),
         default=["detections"],
         help="kinds of evidence (default: detections); of motion, 0 as --camera-height means that it is not known",
     )
@@ -59,10 +60,12 @@ def run(args: argparse.Namespace) -> int:
     check_file("--out", args.out)
     rigs = [] if args.rig == "none" else load_rigs(args.rig)
     for source in dict.fromkeys(args.sources):
-        if source == "detections":
+        if source in ("detections", "sizes"):
             dataset = dataset_of(args)
-            if not dataset.has_detections:
-                raise InputError("--detections", "boxes of a detector", "none", "boxes made of masks show no rig")
+            if dataset.has_detections != (source == "detections"):
+                expected, found = ("boxes of a detector", "none") if source == "detections" else ("none", "some")
+                cure = "--from detections takes the boxes of a detector, --from sizes masks alone (docs/no_boxes.md)"
+                raise InputError("--detections", expected, found, cure)
             with Bar(desc=source, unit="frame", disable=None) as bar:
                 estimate_rigs(dataset, lambda _: bar.update(), rigs)
         elif source == "motion":

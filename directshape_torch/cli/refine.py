@@ -171,10 +171,6 @@ def _rigs_of_run(dataset: StereoDataset, rig: str, out_dir: Path, fresh: bool) -
         for estimate in kept:
             print(f"{estimate} (kept)")
         return kept, False
-    if not dataset.has_detections:
-        said = "note: boxes made of masks tell nothing of the rig, so cameras may be off by rig.disparity_sigma_px"
-        print(f"{said}: give --rig FILE, or detections (docs/no_boxes.md)", file=sys.stderr)
-        return [], False
     with Bar(desc="rig", unit="frame") as bar:
         rigs = estimate_rigs(dataset, lambda _: bar.update())
     for estimate in rigs:
@@ -194,7 +190,7 @@ def _learn(dataset: StereoDataset, refiner: DirectShapeRefiner, rigs: RigEstimat
 def _say_where_rigs_are_guesses(rigs: Sequence[RigEstimate]) -> None:
     for estimate in rigs:
         if estimate.is_guess:
-            few = f"note: {len(estimate.rows)} detections hardly show the rig, so depths by disparity count for less"
+            few = f"note: {len(estimate.uv_of_cars)} cars hardly show the rig, so depths by disparity count for less"
             print(f"{few}: give more frames, or --rig FILE (docs/your_rig.md)", file=sys.stderr)
 
 

@@ -1,6 +1,12 @@
-"""This module compares measured disparities on the near side of each car with those that its box implies."""
+"""This module compares measured disparities on the near side of each car with those that its box or size implies.
+
+A box that was made of the images' own disparities moves with them, so its depth is no evidence of a rig. Such a box is
+moved along its viewing ray until it looks as high as its mask, and then the height of a mean car implies its depth.
+"""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -48,6 +54,8 @@ _CORNERS = ((0.20, -1.0, 0.36), (0.46, -0.62, 0.46), (0.48, -0.35, 0.50), (0.38,
 _MASK_OVER_CORNERS = 0.977
 _MASK_BORDER_PX = 2
 _LARGEST_SIZE_ERROR = 0.2
+# A box becomes larger in the image as it comes nearer, but its sides turn too, so it is moved so many times.
+_NUM_MOVES = 3
 _FEWEST_MASK_PIXELS = 100
 
 
@@ -106,6 +114,29 @@ def observe_detections(frames: FrameBatch, detections: Detections) -> Tensor:  #
     """
     rows = [row for frame in range(len(frames)) for row in _rows_of_frame(frames, detections, frame)]
     return torch.stack(rows) if rows else torch.zeros(0, len(COLUMNS), dtype=torch.float64)
+
+
+def observe_sizes(frames: FrameBatch, detections: Detections) -> Tensor:  # (N, 8)
+    """The rows of cars whose boxes were made of masks, at the depths that the heights of their masks imply.
+
+    A car makes no row if the height of its mask is unknown (`size_error`). The last column has no meaning.
+    """
+    if detections.is_from_masks is None or not bool(detections.is_from_masks.any()):
+        return torch.zeros(0, len(COLUMNS), dtype=torch.float64)
+    of_masks = detections.rows(detections.is_from_masks.nonzero()[:, 0])
+    T_cam_obj = torch.stack([_placed_by_size(frames, of_masks, car) for car in range(len(of_masks))])
+    return observe_detections(frames, replace(of_masks, T_cam_obj=T_cam_obj, is_from_masks=None))
+
+
+def _placed_by_size(frames: FrameBatch, detections: Detections, car: int) -> Tensor:  # (4, 4)
+    """The pose of a box where it is as high in the image as its mask; the place is NaN if that is unknown."""
+    T_cam_obj, frame = detections.T_cam_obj[car].detach().clone(), int(detections.frame_index[car])
+    height, width = frames.sizes[frame].tolist()
+    mask = detections.mask_left[car][:height, :width].detach() > MASK_THRESHOLD
+    for _ in range(_NUM_MOVES):
+        error = size_error(T_cam_obj, detections.dimensions_hwl[car].detach(), mask, frames.camera.K_left[frame])
+        T_cam_obj[:3, 3] /= 1 + error if error else torch.nan
+    return T_cam_obj
 
 
 def _rows_of_frame(frames: FrameBatch, detections: Detections, frame: int) -> list[Tensor]:

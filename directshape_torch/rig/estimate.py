@@ -16,9 +16,9 @@ from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, Dispari
 from directshape_torch.numerics.checks import check_shape
 from directshape_torch.numerics.conversion import as_floating
 from directshape_torch.rig import detector_noise
-from directshape_torch.rig.detections import COLUMNS, observe_detections
+from directshape_torch.rig.detections import COLUMNS, observe_detections, observe_sizes
 from directshape_torch.rig.pixels import PixelEvidence, hull
-from directshape_torch.rig.posterior import BIAS, Posterior, solve_offsets, solve_rows
+from directshape_torch.rig.posterior import BIAS, SIZE, Posterior, solve_offsets, solve_rows
 from directshape_torch.rig.rig import Rig
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
@@ -28,9 +28,8 @@ if TYPE_CHECKING:
 
 # A service may run for years, but more cars than this say nothing new.
 _MOST_ROWS = 1000
-# Fewer detections hardly show a field. The prior decides then, and rigs such as KITTI's are farther off than it
-# expects.
-_FEWEST_DETECTIONS = 30
+# Fewer cars hardly show a field. The prior decides then, and rigs such as KITTI's are farther off than it expects.
+_FEWEST_CARS = 30
 
 # No image is wider than this, and powers of larger numbers would exhaust the digits of a sum.
 _LARGEST_PX = 1e5
@@ -55,9 +54,9 @@ class RigEstimate(nn.Module):
     """This estimates the rig's disparity field and the detector's depth error from all evidence
     (docs/derivations/rig.md).
 
-    It keeps the evidence: one row for each car, and sums over pixels of known depth. So order and portions of the
-    frames do not matter. The evidence stays on the CPU in float64, and in the `state_dict` as extra state. A field
-    moves to the device of the tensors that it is asked for.
+    It keeps the evidence: one row for each car, by its detection or by its size, and sums over pixels of known depth.
+    So order and portions of the frames do not matter. The evidence stays on the CPU in float64, and in the
+    `state_dict` as extra state. A field moves to the device of the tensors that it is asked for.
 
     Args:
         size_wh: width and height of the rig's images.
@@ -80,6 +79,7 @@ class RigEstimate(nn.Module):
         matrices = (matrix.detach().double().cpu() for matrix in (K_left, K_right, T_right_cam))
         self._blank = DisparityField.constant(0.0, size_wh, *matrices)
         self.rows = torch.zeros(0, len(COLUMNS), dtype=torch.float64)
+        self.sizes = self.rows
         self.results = torch.zeros(0, detector_noise.NUM_COLUMNS, dtype=torch.float64)
         self.pixels: dict[str, PixelEvidence] = {}
         self._solved: tuple[Posterior, DisparityField] | None = None
@@ -90,7 +90,10 @@ class RigEstimate(nn.Module):
         return cls(*Rig.of_frame(frames))
 
     def update(self, frames: FrameBatch, detections: Detections) -> None:
-        """Add the evidence of the detections of further frames; boxes that were made of masks are no evidence.
+        """Add the evidence of the detections of further frames.
+
+        The depth of a box that was made of masks is no evidence, because it moves with the images' own disparities. The
+        height of the mask is evidence, because a car's size gives its depth.
 
         Args:
             frames: frames of this rig. A frame that was added before does not count again.
@@ -101,14 +104,15 @@ class RigEstimate(nn.Module):
         """
         self._check_frames(frames)
         self.add_rows(observe_detections(frames, detections))
+        self.add_sizes(observe_sizes(frames, detections))
 
     def add_rows(self, rows: Tensor) -> None:
         """Add reduced observations (N, 8) of detections in `rig.detections.COLUMNS`; others raise `InputError`."""
-        check_shape("rows", rows, ("N", len(COLUMNS)), kind="floating")
-        largest = float(rows.detach().abs().amax()) if len(rows) else 0.0
-        if not largest <= _LARGEST_PX:
-            raise InputError("rows", f"finite pixels of at most {_LARGEST_PX:g}", f"{largest:g}")
-        self.rows, self._solved = _kept_rows(torch.cat([self.rows, rows.detach().to(self.rows)])), None
+        self.rows, self._solved = _with_rows(self.rows, rows), None
+
+    def add_sizes(self, rows: Tensor) -> None:
+        """Add reduced observations (N, 8) of sizes, as `observe_sizes` makes them; others raise `InputError`."""
+        self.sizes, self._solved = _with_rows(self.sizes, rows), None
 
     def add_pixels(self, kind: str, evidence: PixelEvidence) -> None:
         """Add pixels of known depth; `kind` is "lidar", "disparity" or "motion"."""
@@ -152,12 +156,12 @@ class RigEstimate(nn.Module):
 
     @property
     def mean(self) -> Tensor:
-        """Mean (12,): field coefficients (pixels), relative depth bias of the detector, its setback (metres)."""
+        """Mean (14,) of the unknowns in `rig.posterior.Posterior`."""
         return self._solve()[0].mean
 
     @property
     def covariance(self) -> Tensor:
-        """Covariance (12, 12) of `mean`."""
+        """Covariance (14, 14) of `mean`."""
         return self._solve()[0].covariance
 
     @property
@@ -179,11 +183,23 @@ class RigEstimate(nn.Module):
         """Measured minus true disparity and its standard deviation, pixels; beyond the data the nearest data decide."""
         return self.field.bias(uv_left), self.field.sigma(uv_left)
 
+    @property
+    def uv_of_cars(self) -> Tensor:
+        """Places (N, 2) of all cars in the left image, pixels."""
+        return torch.cat([self.rows, self.sizes])[:, :2]
+
+    def offsets_of_cars(self) -> Tensor:
+        """Offsets (N,) that all cars show, in pixels, without what their boxes or sizes are off by in common."""
+        mean = self.mean
+        shares = [(self.rows, mean[BIAS]), (self.sizes, mean[SIZE])]
+        return torch.cat([rows[:, 3] - share * rows[:, 2] for rows, share in shares])
+
     def in_the_middle(self) -> tuple[float, float]:
         """Offset and its standard deviation, pixels, at the median place of the cars, or at the centre without cars."""
         width, height = self._blank.size_wh
         centre = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64)
-        mean, sigma = self.offset_at(self.rows[:, :2].median(dim=0).values if len(self.rows) else centre)
+        uv = self.uv_of_cars
+        mean, sigma = self.offset_at(uv.median(dim=0).values if len(uv) else centre)
         return float(mean), float(sigma)
 
     def corrected(self, frames: FrameBatch) -> FrameBatch:
@@ -225,8 +241,8 @@ class RigEstimate(nn.Module):
 
     @property
     def is_guess(self) -> bool:
-        """Whether the field is hardly more than the prior: it has fewer than 30 detections and no other evidence."""
-        return len(self.rows) < _FEWEST_DETECTIONS and not self.pixels
+        """Whether the field is hardly more than the prior: it has fewer than 30 cars and no pixels of known depth."""
+        return len(self.uv_of_cars) < _FEWEST_CARS and not self.pixels
 
     def _is_own(self, field: DisparityField | None) -> bool:
         if field is None:
@@ -238,6 +254,7 @@ class RigEstimate(nn.Module):
         """Say in one line what was found and from which evidence."""
         (offset, sigma), detector = self.in_the_middle(), self.detector
         sources = [f"{len(self.rows)} detections"] if len(self.rows) else []
+        sources += [f"the sizes of {len(self.sizes)} cars"] if len(self.sizes) else []
         sources += [f"{kind} ({e.num_frames} frames)" for kind, e in sorted(self.pixels.items())]
         line = f"rig: {offset:+.2f} +- {sigma:.2f} px in the middle, from {', '.join(sources) or 'nothing'}"
         if len(self.rows):
@@ -248,7 +265,7 @@ class RigEstimate(nn.Module):
     def along_the_width(self) -> str:
         """Offsets with their standard deviations across the image, on the row of `in_the_middle`, in one line."""
         width, height = self._blank.size_wh
-        v = float(self.rows[:, 1].median()) if len(self.rows) else (height - 1) / 2
+        v = float(self.uv_of_cars[:, 1].median()) if len(self.uv_of_cars) else (height - 1) / 2
         u = torch.linspace(0.05, 0.95, 5, dtype=torch.float64) * (width - 1)
         mean, sigma = self.offset_at(torch.stack([u, torch.full_like(u, v)], dim=1))
         known = zip(u.tolist(), mean.tolist(), sigma.tolist(), strict=True)
@@ -271,8 +288,8 @@ class RigEstimate(nn.Module):
         size_wh, *matrices = (list(part) if isinstance(part, tuple) else part.tolist() for part in self._blank.rig)
         pixels = {kind: {n: _plain(x) for n, x in sums._asdict().items()} for kind, sums in self.pixels.items()}
         rig = dict(zip(("K_left", "K_right", "T_right_cam"), matrices, strict=True))
-        seen = {"rows": self.rows.tolist(), "results": self.results.tolist(), "pixels": pixels}
-        return {"size_wh": size_wh, **rig, **seen}
+        seen = {name: getattr(self, name).tolist() for name in ("rows", "sizes", "results")}
+        return {"size_wh": size_wh, **rig, **seen, "pixels": pixels}
 
     @classmethod
     def of_content(cls, content: Any) -> Self:
@@ -282,8 +299,10 @@ class RigEstimate(nn.Module):
             sizes = {"K_left": 3, "K_right": 3, "T_right_cam": 4}
             rig = cls((width, height), *(to_tensor(content, name, (n, n)) for name, n in sizes.items()))
             rig.add_rows(to_tensor(content, "rows", (None, len(COLUMNS))))
-            # Files of earlier versions hold no results.
-            rig.add_results(to_tensor({"results": [], **content}, "results", (None, detector_noise.NUM_COLUMNS)))
+            # Files of earlier versions hold neither sizes nor results.
+            content = {"sizes": [], "results": [], **content}
+            rig.add_sizes(to_tensor(content, "sizes", (None, len(COLUMNS))))
+            rig.add_results(to_tensor(content, "results", (None, detector_noise.NUM_COLUMNS)))
             for kind, sums in content["pixels"].items():
                 points, frames, *names = PixelEvidence._fields
                 tensors = (to_tensor(sums, name, shape) for name, shape in zip(names, _OF_PIXELS, strict=True))
@@ -304,7 +323,7 @@ class RigEstimate(nn.Module):
         except DAMAGE as error:
             raise InputError("state", "what get_extra_state has made", f"something else ({error})") from error
         self._blank, self.rows, self.pixels, self._solved = other._blank, other.rows, other.pixels, None
-        self.results = other.results
+        self.sizes, self.results = other.sizes, other.results
 
     @property
     def _focal_baseline(self) -> float:
@@ -317,8 +336,8 @@ class RigEstimate(nn.Module):
             for e in self.pixels.values():
                 of_field = of_field[0] + e.information, of_field[1] + e.vector
                 of_rows = of_rows[0] + e.row_information, of_rows[1] + e.row_vector
-            found = solve_offsets(self.rows, blank.size_wh, self._focal_baseline, *of_field)
-            row_offsets = solve_rows(self.rows, blank.size_wh, *of_rows)
+            found = solve_offsets(self.rows, self.sizes, Rig(*blank.rig), *of_field)
+            row_offsets = solve_rows(torch.cat([self.rows, self.sizes]), blank.size_wh, *of_rows)
             field = replace(
                 blank,
                 coefficients=found.mean[:NUM_COEFFICIENTS],
@@ -332,7 +351,7 @@ class RigEstimate(nn.Module):
     def _hull(self) -> Tensor:
         """Hull (M, 2) of all data, or the whole image if there are no data, because the field is constant then."""
         around = torch.tensor([[-1.0, -1.0], [1, -1], [1, 1], [-1, 1]]).double() * torch.tensor(_CAR_UV_PX).double()
-        corners = [(self.rows[:, None, :2] + around).reshape(-1, 2), *(e.hull_uv for e in self.pixels.values())]
+        corners = [(self.uv_of_cars[:, None] + around).reshape(-1, 2), *(e.hull_uv for e in self.pixels.values())]
         uv = torch.cat(corners)
         return hull(uv) if len(uv) else self._blank.hull_uv
 
@@ -349,6 +368,14 @@ def to_tensor(entry: Mapping[str, Any], name: str, shape: tuple[int | None, ...]
     if not fits or not bool(tensor.isfinite().all()):
         raise ValueError(f"{name!r} must be finite numbers of shape {shape}, got {tuple(tensor.shape)}")
     return tensor
+
+
+def _with_rows(rows: Tensor, more: Tensor) -> Tensor:
+    check_shape("rows", more, ("N", len(COLUMNS)), kind="floating")
+    largest = float(more.detach().abs().amax()) if len(more) else 0.0
+    if not largest <= _LARGEST_PX:
+        raise InputError("rows", f"finite pixels of at most {_LARGEST_PX:g}", f"{largest:g}")
+    return _kept_rows(torch.cat([rows, more.detach().to(rows)]))
 
 
 def _kept_rows(rows: Tensor) -> Tensor:

@@ -55,8 +55,8 @@ def estimate_rigs(
 
     Frames with cars are taken evenly from all frames, at most 60 for each rig, until the field is known to 0.06 px in
     the middle of the cars. Files that cannot be read are skipped here; the refinement reports them later. The evidence
-    is added to the known `rigs`, and new rigs join the list. `tell` gets the name of each frame. Boxes that are made of
-    masks are no evidence, so a data set without detections adds none.
+    is added to the known `rigs`, and new rigs join the list. `tell` gets the name of each frame. Of a data set without
+    detections the sizes of cars are the evidence.
     """
     plain, rigs = replace(dataset, ground="camera_height", disparity_fields=()), [] if rigs is None else rigs
     for frame_ids in _frames_by_rig(plain):
@@ -78,13 +78,16 @@ def _take_in(
     dataset: StereoDataset, frame_ids: Sequence[str], tell: Callable[[str], object], rigs: list[RigEstimate]
 ) -> None:
     rig, num_seen = _rig_of_first(dataset, frame_ids, rigs), 0
-    if rig is None or not dataset.has_detections:
+    if rig is None:
         return
     for frame_id in evenly(frame_ids):
         with suppress(DirectShapeError, OSError):
-            if not any(found.type in dataset.classes for found in dataset.objects(frame_id)):
+            objects = dataset.objects(frame_id)
+            if dataset.has_detections and not any(found.type in dataset.classes for found in objects):
                 continue
             loaded = dataset.load(frame_id)
+            if not len(loaded.detections):
+                continue
             rig.update(loaded.frame, loaded.detections)
             num_seen += 1
             tell(frame_id)

@@ -4,7 +4,8 @@
 
 `d` is the measured disparity. The implied disparity contains the detector's error, and a regressor that shares the
 noise of the offset would bias the fit. The noise is Student-t of variance `(s d)^2 + s0^2 + sigma^2`. The noises and
-the scale of the field are summed over a grid, so that uncertainty about them widens the covariance.
+the scale of the field are summed over a grid, so that uncertainty about them widens the covariance. Where the height of
+a mask implies the disparity, `size d + mask b / height` takes the place of `bias d`, and `s` is the spread of sizes.
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ from torch import Tensor
 
 from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, polynomial_basis
 from directshape_torch.rig.pixels import by_degree
+from directshape_torch.rig.rig import Rig
+from directshape_torch.start.rectangle_fit import MEAN_HWL
 
-BIAS, SETBACK = NUM_COEFFICIENTS, NUM_COEFFICIENTS + 1
+BIAS, SETBACK, SIZE, MASK = range(NUM_COEFFICIENTS, NUM_COEFFICIENTS + 4)
 
 # Rectification leaves errors of these standard deviations in pixels for each degree. They are larger towards the edges
 # than in the middle, and smaller for rows. A rig may be better or exact, so each of the factors in `_FIELD_SCALES` is
@@ -34,6 +37,9 @@ _DIMENSIONS_SIGMA, _SIZE_SIGMA = 0.04, 0.08
 # Surfaces lie beside the near side of their boxes, at a distance that the cars of one detector share. This is the
 # standard deviation of the distance.
 _SETBACK_SIGMA_M = 0.15
+# The mean height of the cars of one place differs from that of KITTI's cars by this relative standard deviation, and
+# the heights of single cars differ by the second one. All masks are too high or too low by so many pixels in common.
+_MEAN_SIZE_SIGMA, _SIZE_NOISE, _MASK_SIGMA_PX = 0.04, 0.06, 0.25
 
 _DEGREES_OF_FREEDOM = 4
 _NUM_ITERATIONS = 30
@@ -46,26 +52,34 @@ _CONSTANT_NOISE, _CONSTANT_NOISE_PRIOR = torch.tensor([0.15, 0.25, 0.4, 0.7], dt
 class Posterior(NamedTuple):
     """This is what is known of one rig and of the detector that uses it."""
 
-    mean: Tensor  # (12,) field coefficients (pixels), relative bias of the depth, setback (metres)
-    covariance: Tensor  # (12, 12)
+    # (14,) field coefficients (pixels), relative bias of the depth, setback (metres), relative error of the mean size
+    # of cars, error of the height of masks (pixels)
+    mean: Tensor
+    covariance: Tensor  # (14, 14)
     depth_noise: float  # standard deviation of the detector's relative depth
     constant_noise_px: float
 
 
 def solve_offsets(
     rows: Tensor,  # (N, 8) of `observe_detections`
-    size_wh: tuple[int, int],
-    focal_baseline: float,  # pixels x metres
+    sizes: Tensor,  # (M, 8) of `observe_sizes`
+    rig: Rig,
     information: Tensor,  # (10, 10) of the field coefficients by other evidence
     vector: Tensor,  # (10,)
 ) -> Posterior:
     """Mean and covariance of all unknowns; without any evidence the priors give them."""
-    u_v, d, offset, sigma = rows[:, :2], rows[:, 2], rows[:, 3], rows[:, 4]
-    A = torch.cat([polynomial_basis(u_v, size_wh), d[:, None], d[:, None] ** 2 / focal_baseline], dim=1)
+    cars = torch.cat([rows, sizes])
+    d, offset, sigma = cars[:, 2], cars[:, 3], cars[:, 4]
+    is_size, baseline = (torch.arange(len(cars)) >= len(rows)).double(), -rig.T_right_cam[0, 3]
+    of_mask = is_size * baseline / MEAN_HWL[0]
+    own = torch.stack([(1 - is_size) * d, d**2 / (rig.K_left[0, 0] * baseline), is_size * d, of_mask], dim=1)
+    A = torch.cat([polynomial_basis(cars[:, :2], rig.size_wh), own], dim=1)
     grid = torch.meshgrid(_DEPTH_NOISE, _CONSTANT_NOISE, _FIELD_SCALES, indexing="ij")
     s, s0, scale = (x.reshape(-1) for x in grid)
-    variance = (s[:, None] * d) ** 2 + s0[:, None] ** 2 + sigma**2
-    own_sigma = torch.stack([_BIAS_OVER_NOISE * s, torch.full_like(s, _SETBACK_SIGMA_M)], dim=1)
+    relative = torch.where(is_size > 0, _SIZE_NOISE, s[:, None])
+    variance = (relative * d) ** 2 + s0[:, None] ** 2 + sigma**2
+    common = s.new_tensor([_SETBACK_SIGMA_M, _MEAN_SIZE_SIGMA, _MASK_SIGMA_PX]).expand(len(s), 3)
+    own_sigma = torch.cat([_BIAS_OVER_NOISE * s[:, None], common], dim=1)
     prior_sigma = torch.cat([scale[:, None] * by_degree(_FIELD_SIGMA_PX), own_sigma], dim=1)
     H_prior, b_prior = torch.diag_embed(1 / prior_sigma**2), torch.zeros_like(prior_sigma[0])
     H_prior[:, :NUM_COEFFICIENTS, :NUM_COEFFICIENTS] += information

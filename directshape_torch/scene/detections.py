@@ -232,9 +232,9 @@ class Detections(TensorRecord):
         headings of that. A mask that shows too little disparity, nothing of a car's size on the road, or more than one
         car, gets a pose of NaN and, from a refiner, the status `no_start`.
 
-        The boxes are made of the same disparities that a rig would be checked with, so they are no evidence of it
-        (`is_from_masks`): frames need a camera whose disparity is right, or a known `disparity_field`, such as
-        `RigEstimate.corrected` gives them.
+        The boxes are made of the same disparities that a rig would be checked with, so their depths are no evidence of
+        it (`is_from_masks`), but the sizes of their cars are (`RigEstimate.update`). Frames need a camera whose
+        disparity is right, or a known `disparity_field`, such as `RigEstimate.corrected` gives them.
 
         Args:
             frames: F frames; frames with a disparity of their own are not matched.

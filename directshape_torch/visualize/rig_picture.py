@@ -25,11 +25,10 @@ _HULL = (120, 120, 120)
 def draw_rigs(
     rigs: Sequence[RigEstimate],  # at least one
 ) -> Picture:  # (H, W, 3) RGB
-    """Pictures of rigs, one below the other: the estimate in words, and the field with offsets less detector bias."""
+    """Pictures of rigs, one below the other: the estimate in words, and the field with the offsets of cars."""
     pictures = []
     for rig in rigs:
-        offset = rig.rows[:, 3] - rig.detector.bias * rig.rows[:, 2]
-        pictures.append(titled(draw_disparity_field(rig.field, rig.rows[:, :2], offset), str(rig)))
+        pictures.append(titled(draw_disparity_field(rig.field, rig.uv_of_cars, rig.offsets_of_cars()), str(rig)))
     return beside(pictures, below=True)
 
 

@@ -51,7 +51,7 @@ def _of_rig(name: str, rig: RigEstimate) -> str:
     off = f"the disparity of {name} is known to {sigma:.2f} px, so cars in one part of the image may be off alike"
     off += f", by {sigma * rig.metres_per_pixel(_AT_M):.2f} m at {_AT_M:.0f} m"
     if rig.is_guess:
-        return f"{off}: {len(rig.rows)} detections hardly show it; give more frames, or --rig FILE (docs/your_rig.md)"
+        return f"{off}: {len(rig.uv_of_cars)} cars hardly show it; give more frames, or --rig FILE (docs/your_rig.md)"
     if sigma * rig.metres_per_pixel(_AT_M) > _LARGE_M:
         return f"{off}; calibrate-rig can tell it better (docs/your_rig.md)"
     return off

@@ -14,6 +14,7 @@ import directshape_torch
 from directshape_torch.cli.main import main
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.result_files import read_shapes
+from directshape_torch.rig.rig_file import load_rigs
 
 DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 QUICK = ("--set", "stages=[{max_iterations: 3, image_level: 1}]", "--device", "cpu")
@@ -76,8 +77,11 @@ def test_a_run_goes_on_and_is_not_one_with_boxes(
     assert main(["refine", *inputs(masks), "--out", str(out), *QUICK]) == 0
     printed = capsys.readouterr()
     assert "1 done, 1 of them in an earlier run" in printed.out
-    assert "boxes made of masks tell nothing of the rig" in printed.err
-    assert not (out / "rig.json").exists()
+    line = next(line for line in printed.out.splitlines() if line.startswith("rig: "))
+    assert "px in the middle, from the sizes of " in line
+    assert line.endswith(" cars (kept)")
+    assert "detector" not in printed.out
+    assert (out / "rig.png").is_file()
     boxes = ["--detections", str(DEMO / "detections" / "noisy_stereo")]
     assert main(["refine", *inputs(masks), *boxes, "--rig", "none", "--out", str(out), *QUICK]) == 2
     assert "boxes" in capsys.readouterr().err
@@ -114,13 +118,18 @@ def test_only_masks_of_cars_become_boxes(masks: Path, tmp_path: Path, capsys: py
     assert "classes: expected Car" in capsys.readouterr().err
 
 
-def test_masks_show_no_rig(masks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["calibrate-rig", *inputs(masks), "--out", str(tmp_path / "rig.json")]) == 2
-    assert (
-        "--detections: expected boxes of a detector, got none; boxes made of masks show no rig"
-        in capsys.readouterr().err
-    )
-    assert not (tmp_path / "rig.json").exists()
+def test_masks_show_a_rig_by_sizes_alone(masks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "rig.json"
+    command = ["calibrate-rig", *inputs(masks), "--out", str(path)]
+    assert main(command) == 2
+    assert "--detections: expected boxes of a detector, got none; --from detections" in capsys.readouterr().err
+    boxes = ["--detections", str(DEMO / "detections" / "noisy_stereo")]
+    assert main([*command, *boxes, "--from", "sizes"]) == 2
+    assert "--detections: expected none, got some" in capsys.readouterr().err
+    assert not path.exists()
+    assert main([*command, "--from", "sizes"]) == 0
+    assert "from the sizes of " in capsys.readouterr().out
+    assert len(load_rigs(path)[0].sizes)
 
 
 def test_a_run_that_is_not_there_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

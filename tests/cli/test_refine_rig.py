@@ -33,7 +33,7 @@ def test_is_estimated_kept_and_shown(source: Path, tmp_path: Path, capsys: pytes
     assert main(command(source, out, "--frames", "0")) == 0
     printed = capsys.readouterr()
     line = next(line for line in printed.out.splitlines() if line.startswith("rig: "))
-    assert "detections hardly show the rig" in printed.err
+    assert "cars hardly show the rig" in printed.err
     detector = next(line for line in printed.out.splitlines() if line.startswith("detector: off by depth "))
     assert detector.endswith(" results")
     assert line.endswith("%")

@@ -14,14 +14,21 @@ FOCAL_BASELINE = 721.0 * 0.54
 FIELD = torch.tensor([-0.3, 0.1, 0.2, -0.3, 0.1, 0.2, -0.1, 0.1, 0.0, -0.4], dtype=torch.float64)
 
 
-def estimate(rows: Tensor | None = None, size_wh: tuple[int, int] = SIZE_WH, focal_px: float = 721.0) -> RigEstimate:
-    """The estimate of a rig like KITTI's with these rows."""
+def estimate(
+    rows: Tensor | None = None,
+    size_wh: tuple[int, int] = SIZE_WH,
+    focal_px: float = 721.0,
+    sizes: Tensor | None = None,
+) -> RigEstimate:
+    """The estimate of a rig like KITTI's with these rows of detections and of sizes."""
     K = torch.tensor([[focal_px, 0, 620], [0, focal_px, 172], [0, 0, 1]], dtype=torch.float64)
     T_right_cam = torch.eye(4, dtype=torch.float64)
     T_right_cam[0, 3] = -0.54
     rig = RigEstimate(size_wh, K, K, T_right_cam)
     if rows is not None:
         rig.add_rows(rows)
+    if sizes is not None:
+        rig.add_sizes(sizes)
     return rig
 
 

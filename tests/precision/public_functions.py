@@ -161,6 +161,12 @@ def estimate() -> RigEstimate:
     return made
 
 
+def with_sizes(rows: Tensor) -> RigEstimate:
+    rig = RigEstimate.of_frames(street()[0])
+    rig.add_sizes(rows)
+    return rig
+
+
 def with_rows(rows: Tensor) -> RigEstimate:
     made = RigEstimate.of_frames(street()[0])
     made.add_rows(rows)
@@ -288,6 +294,9 @@ CASES: dict[str, Case] = {
     "RigEstimate.informed": lambda _: tensors(estimate().informed(estimate().corrected(street()[0]), street()[1])),
     "DisparityProfile.cost_at": lambda _: result().profile.cost_at(0.5),
     "RigEstimate.add_rows": lambda _: with_rows(torch.full((1, 8), 7.3, dtype=torch.float32)).mean,
+    "RigEstimate.add_sizes": lambda _: with_sizes(torch.full((1, 8), 7.3, dtype=torch.float32)).mean,
+    "RigEstimate.uv_of_cars": lambda _: estimate().uv_of_cars,
+    "RigEstimate.offsets_of_cars": lambda _: estimate().offsets_of_cars(),
     "RigEstimate.learn": lambda _: learnt().results,
     "RigEstimate.detector_sigmas": lambda _: learnt().detector_sigmas(),
     "RigEstimate.in_the_middle": lambda _: torch.tensor(estimate().in_the_middle(), dtype=torch.float64),

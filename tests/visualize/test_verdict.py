@@ -48,6 +48,6 @@ def test_a_rig_that_is_a_guess_says_so_and_what_it_means_in_metres() -> None:
     _, sigma = rig.in_the_middle()
     assert sentence.startswith(f"the disparity of the rig is known to {sigma:.2f} px")
     assert f"{sigma * rig.metres_per_pixel(30):.2f} m at 30 m" in sentence
-    assert sentence.endswith("0 detections hardly show it; give more frames, or --rig FILE (docs/your_rig.md)")
+    assert sentence.endswith("0 cars hardly show it; give more frames, or --rig FILE (docs/your_rig.md)")
     assert [line[:25] for line in verdict(frames(), [rig, rig])[1:]] == [f"the disparity of rig {n} is" for n in (1, 2)]
     assert pytest.approx(30**2 / rig.metres_per_pixel(30)) == rig._focal_baseline
