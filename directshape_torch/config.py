@@ -351,6 +351,12 @@ class RefinerConfig(Settings):
         "look for common mistakes in images, calibration, masks and boxes (docs/check_data.md) in the first call of a "
         "refiner, in every call, or never; what is found is a Python warning, and results do not depend on it",
     )
+    search: Literal["rescue", "always", "off"] = setting(
+        "rescue",
+        'find cars by their masks and disparity where the given box does not lead to them: "rescue" (cars that end '
+        'refused, far from their box or beside their mask), "always" (every car, in twice the time) or "off"; it needs '
+        "silhouettes and photometry, and leaves tracks alone",
+    )
     stages: tuple[StageConfig, ...] = (
         StageConfig(contour_width_px=2.0, image_level=1, max_iterations=6, over_relaxation=1.6),
         StageConfig(contour_width_px=0.5, image_level=0, max_iterations=6, over_relaxation=1.6),

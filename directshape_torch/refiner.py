@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import PurePath
 from typing import Protocol
 
@@ -25,6 +26,7 @@ from directshape_torch.refinement.fusion import UNKNOWN_DETECTOR, fused, noise_o
 from directshape_torch.refinement.make_result import unrefined_result
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.refined import Refined
+from directshape_torch.refinement.rescue import searched
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.scene_problem import TermFactory, problem_of_scene
 from directshape_torch.scene.detections import Detections
@@ -145,8 +147,10 @@ class DirectShapeRefiner(nn.Module):
             full_precision(),
             compiling(self.config.compile),
         ):
-            result, started = self._refine(frames, detections, term_weights, noise)
-            return result if noise is None else fused(result, started)
+            result, started = self._refine(frames, detections, term_weights=term_weights, detector_noise=noise)
+            result = result if noise is None else fused(result, started)
+            again = partial(self._refine, frames, term_weights=term_weights)
+            return searched(self.config, frames, detections, noise, result, again)
 
     @property
     def weighs_detector(self) -> bool:
@@ -205,16 +209,18 @@ class DirectShapeRefiner(nn.Module):
         self,
         frames: FrameBatch,
         detections: Detections,
+        chosen: Tensor | None = None,
+        *,
         term_weights: Mapping[str, Tensor] | None,
-        detector_noise: Tensor | None,
+        detector_noise: Tensor | None = None,
     ) -> tuple[RefinementResult, Detections]:
-        """The result, and the detections with the poses that it started from."""
+        """The result of the chosen cars (B,), by default all, and the detections with the poses that it began with."""
         if detections.track_id is not None and detections.other_T_cam_obj is not None:
             return self._refine_facing_one_way(frames, detections, term_weights, detector_noise)
         seen = self._observe(frames, detections)
         cars = replace(self._cars(frames, detections), detector_noise=detector_noise)
         failure = refusals(cars, seen, self.config)
-        usable = Chosen.where(failure < 0)
+        usable = Chosen.where(failure < 0 if chosen is None else (failure < 0) & chosen)
         rows, cars = usable.index, cars.of(usable)
         problem = problem_of_scene(
             self.config, self.prior, frames, detections, cars, seen.of(usable), self.extra_terms, term_weights
@@ -252,11 +258,11 @@ class DirectShapeRefiner(nn.Module):
         has_others = detections.other_T_cam_obj.isfinite().flatten(1).any(dim=1)
         with torch.no_grad():
             by_itself = replace(detections, track_id=None)
-            alone, started = self._refine(frames, by_itself, term_weights, detector_noise)
+            alone, started = self._refine(frames, by_itself, term_weights=term_weights, detector_noise=detector_noise)
             of_front = alone.quality.probability_heading
         started = replace(started, track_id=detections.track_id, other_T_cam_obj=None)
         started, of_front = facing_one_way(frames, started, has_others, of_front)
-        result, started = self._refine(frames, started, term_weights, detector_noise)
+        result, started = self._refine(frames, started, term_weights=term_weights, detector_noise=detector_noise)
         return replace(result, quality=replace(result.quality, probability_heading=of_front)), started
 
     @full_precision()

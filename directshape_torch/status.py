@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 class Status(enum.Enum):
-    """A `Status` is one car's outcome. `converged` and `max_iterations` carry a refined state, others the input."""
+    """A `Status` is one car's outcome. The first two and `rescued` carry a refined state, the others the input."""
 
     converged = "refined: the cost settled, or a further step promises less than half a percent of it"
     max_iterations = (
@@ -52,6 +52,11 @@ class Status(enum.Enum):
         "detector"
     )
 
+    rescued = (
+        "refined from a box made of the car's mask, because the given box did not lead to the car; it is far off where "
+        "result.comparison.distance_in_sigmas is large, and then it is not weighed"
+    )
+
     @property
     def code(self) -> int:
         """Stable number of the status, for tensors and files."""
@@ -60,7 +65,7 @@ class Status(enum.Enum):
     @property
     def is_refined(self) -> bool:
         """Whether the state differs from the input by refinement."""
-        return self in (Status.converged, Status.max_iterations)
+        return self in (Status.converged, Status.max_iterations, Status.rescued)
 
     @classmethod
     def from_code(cls, code: int) -> Status:
@@ -78,7 +83,7 @@ def is_refined(status_code: Tensor) -> Tensor:
 
 
 def counted(counts: Mapping[str, int]) -> str:
-    """How many cars ended in which status, in words; refined cars come first, because both statuses are successes.
+    """How many cars ended in which status, in words; refined cars come first.
 
     Examples:
         >>> counted({"max_iterations": 1, "converged": 4, "no_mask": 2})

@@ -31,7 +31,7 @@ def learn_detector(
     At most 60 frames are taken evenly from the whole data set, whether chosen or not. Frames that cannot be read are
     skipped here and reported when they are refined. `tell` gets the name of each frame.
     """
-    config = replace(refiner.config, acceptance=_EVERY_RESULT, check="off")
+    config = replace(refiner.config, acceptance=_EVERY_RESULT, check="off", search="off")
     alone = DirectShapeRefiner(refiner.prior, config, refiner.extra_terms, rigs)
     like = refiner.prior.origin
     names = evenly(list(dict.fromkeys([*dataset.layout.frame_ids(), *dataset.frame_ids])))

@@ -84,15 +84,23 @@ def fit_quality(
         error, share, contrast = photometric_agreement(photometric, at)
     misfit = error / contrast.clamp_min(_LEAST_CONTRAST)
     evidence = torch.stack(
-        [(halves_apart + 0.02).log(), misfit.clamp_min(0.01).log(), (distance_in_sigmas**2 + 3).log()], dim=1
+        [(halves_apart + 0.02).log(), misfit.clamp_min(0.01).log(), evidence_of_distance(distance_in_sigmas)], dim=1
     ).to(torch.float64)
     is_there = bundled_trust_model().car_is_there(evidence)
-    # The figures were measured with these terms.
-    names = stage.problem.term_names
-    if not {"silhouette_left", "photometric"} <= set(names) or "point_cloud" in names:
+    if not is_judged(stage.problem.term_names):
         is_there = torch.full_like(is_there, torch.nan)
     better, not_worse = (is_there * chance for chance in chances)
     return FitQuality(left, right, error, share, evidence, better, not_worse, torch.full_like(left, torch.nan))
+
+
+def evidence_of_distance(distance_in_sigmas: Tensor) -> Tensor:
+    """The column `log_detector_distance` (B,) of the evidence."""
+    return (distance_in_sigmas**2 + 3).log()
+
+
+def is_judged(term_names: tuple[str, ...]) -> bool:
+    """Whether there are probabilities: their figures were measured with silhouettes and photometry, without points."""
+    return {"silhouette_left", "photometric"} <= set(term_names) and "point_cloud" not in term_names
 
 
 def mask_ious(masks: MaskRows, prepared: Prepared) -> Tensor:

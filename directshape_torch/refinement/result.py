@@ -71,11 +71,11 @@ class RefinementResult(CarRecord):
         T_cam_obj: (B, 4, 4) refined poses, or the input poses where the status says that the car was not refined.
         code: (B, K) shape codes, in standard deviations.
         status_code: (B,) integer, see `status`.
-        iterations: (B,) Gauss-Newton iterations.
+        iterations: (B,) Gauss-Newton iterations. Those of `rescued` cars, and their cost history, are of both starts.
         term_names: names of the T terms.
         cost_before, cost_after: (B, T) cost of each term for input and output, both at the final stage. They are NaN
             for cars that took no part in the refinement. For `not_trusted` cars they belong to the refinement that was
-            not returned.
+            not returned. The input of `rescued` cars is the box that was made of their mask.
         covariance: (B, 6 + K, 6 + K) covariance in the tangent `(v, omega, dcode)` of the object frame, uncalibrated
             (relative). It is NaN for cars that were not refined.
         covariance_xyz_yaw: (B, 4, 4) covariance of the returned box's place (x, y, z) in the reference frame and of its

@@ -89,7 +89,8 @@ class RefinementTrace:
 def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections: Detections) -> RefinementTrace:
     """Refine some cars and keep every state. This takes twice as long as a refinement; gradients are off.
 
-    The last state is the optimum of the images; the result may lie between it and the detector's box.
+    The last state is the optimum of the images; the result may lie between it and the detector's box. The states of a
+    car that was found from its mask are those from the given box.
 
     Raises:
         InputError: frames, detections and prior do not fit together.

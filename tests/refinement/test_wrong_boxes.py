@@ -18,7 +18,8 @@ def refined(factor: float, dimensions: float, *settings: str) -> RefinementResul
     T_cam_obj = first.T_cam_obj.clone()
     T_cam_obj[:, :3, 3] *= factor
     moved = replace(first, T_cam_obj=T_cam_obj, dimensions_hwl=first.dimensions_hwl * dimensions)
-    config = load_config("default", list(settings))
+    # The default finds these cars from their masks.
+    config = load_config("default", ["search=off", *settings])
     result: RefinementResult = DirectShapeRefiner(config=config).to(T_cam_obj.dtype)(scene.frame, moved)
     assert result.sigma_xyz_yaw[result.refined].isfinite().all()
     return result
