@@ -46,7 +46,7 @@ def _share(disparity: Tensor, mask: Tensor, box: list[int]) -> Tensor:
     if min(len(within), len(beyond)) < _FEWEST:
         return disparity.new_tensor(torch.nan)
     low, high = torch.quantile(within, within.new_tensor(_MOST))
-    goes_on = (beyond > low - _SAME_PX) & (beyond < high + _SAME_PX)
+    goes_on: Tensor = (beyond > low - _SAME_PX) & (beyond < high + _SAME_PX)
     return goes_on.to(disparity.dtype).mean()
 
 
