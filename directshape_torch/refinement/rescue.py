@@ -15,7 +15,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from directshape_torch.config import RefinerConfig
+from directshape_torch.config import AcceptanceConfig, RefinerConfig
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.projection import project
 from directshape_torch.numerics.tables import Chosen
@@ -33,15 +33,8 @@ from directshape_torch.state.cars import CarBatch
 from directshape_torch.status import Status
 from directshape_torch.stereo_matching.disparity import with_disparity
 
-# A wrong box explains these statuses.
-_LOST = (
-    Status.not_trusted,
-    Status.mask_missed,
-    Status.no_match,
-    Status.depth_unknown,
-    Status.no_car,
-    Status.rejected_worse,
-)
+# The images refute these results, and a wrong box explains it.
+_REFUTED = (Status.mask_missed, Status.no_match, Status.depth_unknown, Status.no_car, Status.rejected_worse)
 # Good fits cover their masks better than this.
 _LOOSE_IOU = 0.8
 # One box in twenty is a gross error, as one mask in twenty does not show what its box says.
@@ -75,7 +68,7 @@ def searched(
     """
     if config.search == "off" or not is_judged(result.term_names):
         return result
-    lost = _has_own_mask(frames, detections) & _ended(result)
+    lost = _has_own_mask(frames, detections) & (result.refined | _is_of(result, (*_REFUTED, Status.not_trusted)))
     if config.search == "rescue":
         lost = lost & _is_doubted(result)
     if not bool(lost.any()):
@@ -86,30 +79,35 @@ def searched(
         return result
     again, _ = refine(_made_of_masks(frames, detections, result, lost), lost)
     found = Chosen.where(lost & again.refined)
-    given = CarBatch.from_scene(frames, detections)
-    given = replace(given, detector_noise=detector_noise).of(found)
-    later, before = again.rows(found.index), result.rows(found.index)
-    later = _explained(later, given, before)
-    later = fused(later, detections.rows(found.index))
-    quality, limits = later.quality, config.acceptance
+    given = replace(CarBatch.from_scene(frames, detections), detector_noise=detector_noise).of(found)
+    before = result.rows(found.index)
+    later = fused(_explained(again.rows(found.index), given, before), detections.rows(found.index))
+    kept = _is_better(later, before, config.acceptance).nonzero()[:, 0]
+    return going_on(result, found.index[kept], later.rows(kept)) if len(kept) else result
+
+
+def _is_better(later: RefinementResult, before: RefinementResult, limits: AcceptanceConfig) -> Tensor:
+    """Whether (B,) cars that were found from their masks are likely better than the given boxes and than before."""
+    quality = later.quality
     likely = (quality.probability_better >= limits.min_probability_better) & (
         quality.probability_not_worse >= limits.min_probability_not_worse
     )
     # A refined car that covers its mask better from its own box stays where it is.
     closer = quality.mask_iou_left > before.quality.mask_iou_left
-    kept = (likely & (~before.refined | _is_gross(before.quality.evidence) | closer)).nonzero()[:, 0]
-    return going_on(result, found.index[kept], later.rows(kept))
+    return likely & (~before.refined | _is_gross(before.quality.evidence) | closer)
 
 
-def _ended(result: RefinementResult) -> Tensor:
-    """Whether (B,) cars were refined from their boxes, or refused in a way that a wrong box explains."""
-    return result.refined | torch.stack([result.status_code == each.code for each in _LOST]).any(dim=0)
+def _is_of(result: RefinementResult, statuses: tuple[Status, ...]) -> Tensor:
+    return torch.stack([result.status_code == each.code for each in statuses]).any(dim=0)
 
 
 def _is_doubted(result: RefinementResult) -> Tensor:
-    """Whether (B,) cars were refused, lie where their boxes are no measurement of them, or do not cover their masks."""
+    """Whether (B,) results are refuted, lie where their boxes are no measurement of them, or do not cover their masks.
+
+    A result that is merely not trusted has found its car, and would be found there again.
+    """
     quality = result.quality
-    return ~result.refined | _is_gross(quality.evidence) | (quality.mask_iou_left < _LOOSE_IOU)
+    return _is_of(result, _REFUTED) | _is_gross(quality.evidence) | (quality.mask_iou_left < _LOOSE_IOU)
 
 
 def _has_own_mask(frames: FrameBatch, detections: Detections) -> Tensor:

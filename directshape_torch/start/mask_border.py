@@ -37,7 +37,7 @@ def share_going_on(
 def _share(disparity: Tensor, mask: Tensor, box: list[int]) -> Tensor:
     """The share of one mask (h, w), whose upper left pixel is the corner of the box."""
     (u0, v0, u1, v1), reach = box, _AROUND_PX
-    seen = pad(disparity, (reach,) * 4, value=torch.nan)[v0 : v1 + 2 * reach, u0 : u1 + 2 * reach]
+    seen: Tensor = pad(disparity, (reach,) * 4, value=torch.nan)[v0 : v1 + 2 * reach, u0 : u1 + 2 * reach]
     covered = pad(mask, (reach,) * 4)
     inside = seen[~_grown(~covered, _INSIDE_PX)]
     around = _grown(covered, _AROUND_PX) & ~_grown(covered, _MIXED_PX)
