@@ -20,8 +20,8 @@ from directshape_torch.numerics.tensors import occurrences
 
 BLOCK = 64
 """A block has this many rows."""
-# This number replaces components of directions that are nearer to 0.
-_LEAST_DIRECTION = 1e-12
+LEAST_DIRECTION = 1e-12
+"""This number replaces components of directions that are nearer to 0."""
 
 
 @dataclass(frozen=True)
@@ -219,7 +219,7 @@ class ObjectRays(NamedTuple):
     def interval(self, bounds_obj: Tensor) -> Interval:
         """The depths between which rays are inside bounds (2, 3) and in front of their camera."""
         direction = self.direction_obj
-        inverse = 1 / torch.copysign(direction.abs().clamp_min(_LEAST_DIRECTION), direction)
+        inverse = 1 / torch.copysign(direction.abs().clamp_min(LEAST_DIRECTION), direction)
         to_lower, to_upper = (bounds_obj[..., None, None] - self.centre_obj) * inverse
         enters, leaves = torch.minimum(to_lower, to_upper), torch.maximum(to_lower, to_upper)
         near, far = enters.amax(0).clamp_min(0), leaves.amin(0)

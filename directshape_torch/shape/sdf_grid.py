@@ -34,10 +34,10 @@ _TINY = 2e-38
 # A search that begins within this distance along the ray, in cells, before a face begins behind it. Where a search
 # has ended on a face, rounding therefore does not choose the cell in which the next search begins, and beside a second
 # face that cell is still one that the ray comes through.
-_ON_FACE = 1e-4
-_NO_STEP = 1e-12
+ON_FACE = 1e-4
+NO_STEP = 1e-12
 # A slope of a thousandth divided by this number is a distance beyond all grids.
-_BEYOND_GRIDS = 1e-20
+BEYOND_GRIDS = 1e-20
 
 
 class GridShape(NamedTuple):
@@ -115,7 +115,7 @@ class GridShape(NamedTuple):
         found its minimum by then stops on the face that it has reached, and goes on from there when the ray is tracked
         next. A ray whose `near` equals its `far` stays there.
         """
-        step, node, place = _cells_along(self, owner, centre_obj, direction_obj, depth, _ON_FACE)
+        step, node, place = _cells_along(self, owner, centre_obj, direction_obj, depth, ON_FACE)
         along = _derivatives_along(self, node, place, step)
         # From here on, positions on a ray are measured from its start in the direction in which the distance falls. The
         # code below never chooses between two values by a condition, which costs a processor as much as ten sums.
@@ -318,7 +318,7 @@ def _cells_along(
     A face that is no further than `ahead`, in cells, in front of the place along the ray is behind it.
     """
     step = direction_obj * (1 / grid.spacing_m)
-    step = torch.copysign(step.abs().clamp_min(_NO_STEP), step)
+    step = torch.copysign(step.abs().clamp_min(NO_STEP), step)
     position = torch.addcmul(positions(grid, centre_obj), depth, step)
     lower = (position + ahead * step.sign()).floor().clamp_min(0).minimum(_along_axes(grid.last, position) - 1)
     return step, nodes_of(grid, lower_nodes(grid, lower), owner), position - lower
@@ -347,4 +347,4 @@ def _first_root(along: _AlongRay) -> Tensor:
     discriminant = torch.addcmul(second * second, third, first, value=-3)
     # The root of a negative number takes many times as long as other roots.
     below = (second + discriminant.clamp_min(0).sqrt()).clamp_min(0) * discriminant.sign().clamp_min(0)
-    return (-first).clamp_min(0) / (below + _BEYOND_GRIDS)
+    return (-first).clamp_min(0) / (below + BEYOND_GRIDS)

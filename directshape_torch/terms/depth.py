@@ -10,13 +10,16 @@ from __future__ import annotations
 
 from typing import Annotated, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from directshape_torch.compile import compilable
+from directshape_torch.kernels.arguments import ClosestOut, Grid, HitsOut, Search
+from directshape_torch.kernels.choice import array, native_grid, native_rays
 from directshape_torch.numerics.gradient_mode import as_constant
 from directshape_torch.numerics.records import Dense
-from directshape_torch.rows import ObjectRays, Rays
+from directshape_torch.rows import LEAST_DIRECTION, ObjectRays, Rays
 from directshape_torch.shape.field import Field
 
 # The search for the least distance visits this many cells, from the vertex of a parabola through samples. One in a
@@ -55,6 +58,8 @@ _LEAST_SLOPE = 1e-3
 _LEAST_CURVATURE = 1e-6
 # A ray without a surface gets points at this coordinate, beyond every visible car.
 _FAR_M = 1e4
+SEARCH = Search(*map(np.float32, (_MARGIN_M, _AT_END_M, _LEAST_SECOND_DIFFERENCE_M, LEAST_DIRECTION)))
+"""These are the constants of native searches."""
 
 
 class Closest(NamedTuple):
@@ -96,13 +101,33 @@ def marched_views(
     """Closest points of the rays of both images, left first, and hits of the left rays; all are constants."""
     pairs = zip(left, right, (0, 0, 1), strict=True)
     both = Rays(*(torch.cat([x, y], dim=axis) for x, y, axis in pairs))
-    rays, num_left = both.in_objects(T_obj_cam), len(left.owner)
+    num_left = len(left.owner)
+    grid = native_grid(field, bounds_obj, T_obj_cam, both.centre_cam, both.ray_cam)
+    if grid is not None:
+        return _marched_natively(grid, both, num_left, num_samples, T_obj_cam)
+    rays = both.in_objects(T_obj_cam)
     sampled = march(field, both.owner, rays, bounds_obj, num_samples)
     closest = closest_of_march(field, both.owner, rays, bounds_obj, sampled)
     left_rays = ObjectRays(*(x[:, :num_left] for x in rays))
     sampled_left = March(*(x[..., :num_left, :] for x in sampled))
     closest_left = Closest(*(x[..., :num_left, :] for x in closest))
     return closest, first_hits(field, left.owner, left_rays, sampled_left, closest_left)
+
+
+def _marched_natively(
+    grid: Grid, rays: Rays, num_left: int, num_samples: int, T_obj_cam: Tensor
+) -> tuple[Closest, Hits]:
+    from directshape_torch.kernels.march import march  # Numba may be missing.
+
+    depth = torch.empty_like(rays.ray_cam[0])
+    points, is_there = torch.empty_like(rays.ray_cam), torch.empty_like(depth, dtype=torch.bool)
+    closest = Closest(points, depth, is_there, torch.empty_like(points))
+    of_left = points[:, :num_left]
+    hits = Hits(*map(torch.empty_like, (of_left, of_left, is_there[:num_left], depth[:num_left])))
+    into = ClosestOut(*map(array, closest)), HitsOut(*map(array, hits))
+    counts = num_samples, _CELLS_OF_MARCH, _PROBES
+    march(grid, SEARCH, native_rays(rays, T_obj_cam), np.uint64(num_left), *counts, np.float32(_FAR_M), *into)
+    return closest, hits
 
 
 @as_constant

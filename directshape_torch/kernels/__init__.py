@@ -1,0 +1,1 @@
+"""Native loops, compiled by Numba, that take the place of chains of tensor operations on a CPU."""

@@ -1,0 +1,109 @@
+"""This module decides where native loops take the place of tensor operations, and gives them their arguments.
+
+A loop has the results of its tensor operations but for rounding. It is taken for float32 on a CPU where nothing is
+differentiated and the shape is a `GridShape`; everything else takes the tensor operations.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from directshape_torch.kernels import arguments
+from directshape_torch.numerics.gradient_mode import is_plain, nothing_is_differentiated
+from directshape_torch.rows import Rays
+from directshape_torch.shape.sdf_grid import BEYOND_GRIDS, NO_STEP, ON_FACE, GridShape, strides
+
+_logger = logging.getLogger(__name__)
+_is_on: ContextVar[bool] = ContextVar("directshape_torch_kernels", default=True)
+
+
+@contextmanager
+def without_kernels() -> Iterator[None]:
+    """A region in which tensor operations do everything, to compare with.
+
+    Examples:
+        >>> with without_kernels():
+        ...     _is_on.get()
+        False
+    """
+    token = _is_on.set(False)
+    try:
+        yield
+    finally:
+        _is_on.reset(token)
+
+
+def native_grid(field: object, bounds_obj: Tensor, *tensors: Tensor) -> arguments.Grid | None:
+    """The grids of a field for native loops, if they take tensors like these at this place of the program, else None.
+
+    Args:
+        field: signed distances of the cars.
+        bounds_obj: (2, 3) of the prior, metres.
+        tensors: what else a loop gets, at least one tensor of each origin.
+    """
+    # The compiler of tensor operations must see nothing else, and a subclass of the shape may look up anew.
+    if torch.compiler.is_compiling() or type(field) is not GridShape:
+        return None
+    if not _is_on.get() or not nothing_is_differentiated():
+        return None
+    if not all(map(_is_fit, (field.values, field.basis, bounds_obj, *tensors))):
+        return None
+    return _grid(field, bounds_obj) if _is_installed() else None
+
+
+def _is_fit(tensor: Tensor) -> bool:
+    return tensor.dtype == torch.float32 and tensor.device.type == "cpu" and is_plain(tensor)
+
+
+@functools.cache
+def _is_installed() -> bool:
+    try:
+        import directshape_torch.kernels.jit  # noqa: F401
+    except ImportError as error:
+        cure = "pip install 'directshape_torch[fast]'"
+        _logger.warning("without Numba refinements on the CPU take 1.2 times as long (%s): %s", error, cure)
+        return False
+    return True
+
+
+def _grid(shape: GridShape, bounds_obj: Tensor) -> arguments.Grid:
+    x, y, _ = strides(shape)
+    lower, upper = (_point(bound) for bound in bounds_obj)
+    return arguments.Grid(
+        array(shape.values).reshape(-1),
+        array(shape.basis).reshape(-1, shape.basis.shape[3]),
+        np.uint64(shape.basis[..., 0].numel()),
+        np.uint64(x),
+        np.uint64(y),
+        _point(shape.last),
+        _point(shape.origin),
+        lower,
+        upper,
+        *map(np.float32, (shape.spacing_m, 1 / shape.spacing_m, ON_FACE, NO_STEP, BEYOND_GRIDS)),
+    )
+
+
+def _point(numbers: Tensor) -> arguments.Point:
+    x, y, z = map(np.float32, numbers.tolist())
+    return x, y, z
+
+
+def array(tensor: Tensor) -> NDArray[Any]:
+    """The numbers of a tensor, in one piece; a loop writes into a tensor that is in one piece already."""
+    array: NDArray[Any] = tensor.detach().contiguous().numpy()
+    return array
+
+
+def native_rays(rays: Rays, T_obj_cam: Tensor) -> arguments.Rays:
+    """Rays with the poses (B, 4, 4) of their cars."""
+    return arguments.Rays(*map(array, (rays.owner, rays.centre_cam, rays.ray_cam, T_obj_cam)))

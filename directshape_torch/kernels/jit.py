@@ -1,0 +1,34 @@
+"""This module compiles the functions of this package by Numba.
+
+Numba keeps compiled code on the disk, beside the sources or, where it may not write there, in the user's cache folder.
+It compiles anew when the file of a function changes, but not when that function calls another file that has changed.
+Each function that is kept therefore has the argument `_sources`, whose value stands for all files of this package.
+
+A number in the source of a function is float64 to Numba, so constants are `np.float32`. Indices are unsigned, because
+Numba lets signed ones count from the end, which costs a comparison each.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar, cast
+
+import numba
+
+_FunctionT = TypeVar("_FunctionT", bound=Callable[..., object])
+
+SOURCES = zlib.crc32(b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))))
+"""This number changes with the sources of this package."""
+
+
+def loop(function: _FunctionT) -> _FunctionT:
+    """Compile a function that Python calls, and keep its code on the disk; other threads run while it works."""
+    # A division by zero gives infinity or NaN, as it does in tensors.
+    return cast(_FunctionT, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+
+
+def step(function: _FunctionT) -> _FunctionT:
+    """Compile a function that a loop calls."""
+    return cast(_FunctionT, numba.njit(nogil=True, error_model="numpy")(function))

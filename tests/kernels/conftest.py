@@ -1,0 +1,28 @@
+"""This file has benches of the laboratory for the comparison of native loops with tensor operations."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+
+from directshape_torch.laboratory.bench import Bench
+from directshape_torch.laboratory.regimes import REGIMES
+from directshape_torch.laboratory.scenes import load_scene
+from directshape_torch.shape.pca_prior import PCAShapePrior
+
+
+@cache
+def _bench_of(regime: str) -> Bench:
+    return Bench.build(load_scene(), PCAShapePrior.load_bundled().double(), REGIMES[regime], 3, pixels_per_car=100)
+
+
+@pytest.fixture(params=REGIMES)
+def bench(request: pytest.FixtureRequest) -> Bench:
+    """Three states of each regime in turn, float64."""
+    return _bench_of(request.param)
+
+
+@pytest.fixture
+def typical() -> Bench:
+    return _bench_of("typical")

@@ -1,0 +1,118 @@
+"""Native loops are taken where they can be, tensor operations everywhere else."""
+
+from __future__ import annotations
+
+import inspect
+import logging
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from helpers.ellipsoids import ellipsoid_prior
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from directshape_torch.kernels import choice, jit, march
+from directshape_torch.kernels.choice import native_grid, without_kernels
+from directshape_torch.shape.field import PackedField
+from directshape_torch.shape.sdf_grid import GridShape
+
+LOOPS = (march.march,)
+
+
+@pytest.fixture
+def shape() -> GridShape:
+    prior = ellipsoid_prior().float()
+    return prior.bind(prior.initial_code(2))
+
+
+@pytest.fixture
+def bounds() -> Tensor:
+    return ellipsoid_prior().float().bounds_obj
+
+
+def is_taken(shape: object, *tensors: Tensor) -> bool:
+    return native_grid(shape, *tensors) is not None
+
+
+@torch.no_grad()
+def test_single_precision_on_the_cpu_without_derivatives_is_native(shape: GridShape, bounds: Tensor) -> None:
+    assert is_taken(shape, bounds, torch.ones(2))
+    with without_kernels():
+        assert not is_taken(shape, bounds, torch.ones(2))
+    assert not is_taken(PackedField(shape), bounds)
+    assert not is_taken(shape, bounds, torch.ones(2, dtype=torch.float64))
+    assert not is_taken(shape, bounds.to("meta"))
+    assert not is_taken(shape._replace(values=shape.values.double()), bounds)
+    with torch.inference_mode():
+        assert is_taken(shape, bounds)
+
+
+def test_whatever_is_differentiated_takes_tensor_operations(shape: GridShape, bounds: Tensor) -> None:
+    assert not is_taken(shape, bounds)
+    taken = []
+
+    def note(x: Tensor) -> Tensor:
+        taken.append(is_taken(shape, bounds, x))
+        return x
+
+    with torch.no_grad():
+        with forward_ad.dual_level():
+            note(bounds)
+        torch.func.vmap(note)(torch.ones(2, 3))
+        torch.func.jvp(note, (torch.ones(2),), (torch.ones(2),))
+        torch.compile(note, backend="eager")(torch.ones(2))
+        assert is_taken(shape, bounds.clone().requires_grad_())
+    assert taken == [False] * 4
+
+
+@pytest.fixture
+def missing_numba(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setitem(sys.modules, "numba", None)
+    monkeypatch.delitem(sys.modules, "directshape_torch.kernels.jit")
+    choice._is_installed.cache_clear()
+    yield
+    choice._is_installed.cache_clear()
+
+
+@pytest.mark.usefixtures("missing_numba")
+@torch.no_grad()
+def test_without_numba_one_line_says_how_much_slower(
+    shape: GridShape, bounds: Tensor, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        assert not is_taken(shape, bounds)
+        assert not is_taken(shape, bounds)
+    (record,) = caplog.records
+    assert "times as long" in record.getMessage()
+    assert "directshape_torch[fast]" in record.getMessage()
+
+
+@pytest.mark.parametrize("function", LOOPS)
+def test_what_is_kept_on_the_disk_depends_on_all_sources(function: object) -> None:
+    """Numba looks at the file of the loop alone, so the value of an argument stands for the others."""
+    parameter = inspect.signature(function.py_func).parameters["_sources"]  # type: ignore[attr-defined]
+    assert parameter.default == jit.SOURCES
+
+
+def test_code_is_kept_where_the_folder_of_the_package_cannot_be_written(tmp_path: Path) -> None:
+    """A second process finds it. A file in the place of `__pycache__` stops the administrator, too."""
+    module = tmp_path / "module"
+    module.mkdir()
+    (module / "__pycache__").write_text("")
+    source = "from directshape_torch.kernels.jit import loop\n@loop\ndef twice(x):\n    return 2 * x\n"
+    (module / "one_loop.py").write_text(source)
+    command = "import one_loop; one_loop.twice(1.0); print(sum(one_loop.twice.stats.cache_hits.values()))"
+    path = os.pathsep.join([str(module), *sys.path])
+    environment = os.environ | {"PYTHONPATH": path, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    hits = [
+        subprocess.run([sys.executable, "-c", command], env=environment, capture_output=True, text=True, check=True)
+        for _ in range(2)
+    ]
+    assert [int(done.stdout) for done in hits] == [0, 1]
+    assert list((tmp_path / "cache").rglob("*.nbc"))
