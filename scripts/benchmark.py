@@ -2,6 +2,7 @@
 
     python scripts/benchmark.py                                  # times, operations, memory of whole calls
     python scripts/benchmark.py --profile                        # one eager refinement, by part
+    python scripts/benchmark.py --native                         # with native loops over without them
     python scripts/benchmark.py --against ../other_checkout      # times and operations of this version over another's
 
 Frames come from DIRECTSHAPE_DATA (or --data), else from the bundled demo frame. A graphics card is used if there is
@@ -53,7 +54,11 @@ def run(args: argparse.Namespace) -> None:
         from benchmark_suites.checkouts import against_rows
 
         show(against_rows(args.against, root, args.quick))
-    if not args.profile and args.against is None:
+    if args.native:
+        from benchmark_suites.native_loops import native_rows
+
+        show(list(native_rows(root, args.quick)))
+    if not (args.profile or args.native or args.against):
         scenes = load_scenes(root, 1 if args.quick else None)
         show([row for scene in scenes for row in time_rows(scene, device, rounds, args.quick)])
         if device.type != "cpu":
@@ -80,6 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line and run; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--profile", action="store_true", help="time and operations of one eager refinement by part")
+    parser.add_argument("--native", action="store_true", help="with native loops over without them, in turn")
     parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="this version over another one, in turn")
     parser.add_argument("--data", type=Path, metavar="ROOT", help="default: DIRECTSHAPE_DATA")
     parser.add_argument("--device", default="auto", help="cpu, cuda ..; default: cuda where there is one")

@@ -7,17 +7,23 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-Real: TypeAlias = np.float32
+Real: TypeAlias = Any
+"""A float32: a plain number would be float64 to Numba."""
 Reals: TypeAlias = NDArray[np.float32]
 Doubles: TypeAlias = NDArray[np.float64]
 Flags: TypeAlias = NDArray[np.bool_]
 Index: TypeAlias = Any
-"""An unsigned integer; NumPy's and Numba's rules for their sums differ, and Numba's hold."""
+"""An unsigned integer of 64 bits."""
 Point: TypeAlias = tuple[Real, Real, Real]
 
 
+def singles(*numbers: float) -> list[Any]:
+    """Numbers in single precision."""
+    return [np.float32(number) for number in numbers]
+
+
 class Grid(NamedTuple):
-    """A `Grid` is a `GridShape` of B cars with the bounds of its prior, and the small numbers of searches in it."""
+    """A `Grid` is a `GridShape` of B cars, and the constants of searches in it."""
 
     values: Reals  # (B * nodes,) signed distance at the nodes, metres
     basis: Reals  # (nodes, K)
@@ -26,8 +32,6 @@ class Grid(NamedTuple):
     stride_y: Index
     last: Point  # number of the last node along each axis
     origin: Point  # node (0, 0, 0) in the object frame, metres
-    lower: Point  # bounds of the prior in the object frame, metres
-    upper: Point
     spacing_m: Real
     per_m: Real  # cells per metre
     on_face: Real  # the constants of `shape.sdf_grid`
@@ -45,16 +49,18 @@ class Rays(NamedTuple):
 
 
 class Search(NamedTuple):
-    """A `Search` holds the constants of `terms.depth` for searches of closest points."""
+    """A `Search` holds the bounds of a prior and the constants of `terms.depth` for searches of closest points."""
 
+    lower: Point  # metres, in the object frame
+    upper: Point
     margin_m: Real
     at_end_m: Real
     least_second_difference_m: Real
     least_direction: Real  # of `rows`
 
 
-class ClosestOut(NamedTuple):
-    """`ClosestOut` is where the fields of `terms.depth.Closest` are written."""
+class ClosestArrays(NamedTuple):
+    """`ClosestArrays` are the fields of `terms.depth.Closest`."""
 
     points_obj: Reals  # (3, M, R)
     depth: Reals  # (M, R)
@@ -62,10 +68,83 @@ class ClosestOut(NamedTuple):
     face_obj: Reals  # (3, M, R)
 
 
-class HitsOut(NamedTuple):
-    """`HitsOut` is where the fields of `terms.depth.Hits` are written."""
+class HitsArrays(NamedTuple):
+    """`HitsArrays` are the fields of `terms.depth.Hits`."""
 
     points_obj: Reals  # (3, M, R)
     normal_obj: Reals  # (3, M, R)
     found: Flags  # (M, R)
     depth: Reals  # (M, R)
+
+
+class Contour(NamedTuple):
+    """A `Contour` holds the masks of M blocks and the constants of `terms.silhouette` and of tracking."""
+
+    foreground: Reals  # (M, R)
+    filled: Reals  # (M, R)
+    zeta: Reals  # (M, 1)
+    saturation: Real
+    residual_floor: Real
+    sample_m: Real
+    next_cell: Real
+    max_cells: int
+
+
+class Sums(NamedTuple):
+    """`Sums` are the fields of `terms.term.Part` of M blocks that a loop writes, and where its columns begin."""
+
+    cost: Doubles  # (M,)
+    products: Doubles  # (M, D + 1, D)
+    residual: Reals  # (M, R, N)
+    first: int
+
+
+class SurfaceArrays(NamedTuple):
+    """`SurfaceArrays` are the fields of `terms.photometric.Surface`."""
+
+    points_obj: Reals  # (3, M, R)
+    normal_obj: Reals  # (3, M, R)
+    depth: Reals  # (M, R)
+    on_surface: Flags  # (M, R)
+    usable: Flags  # (M, R)
+
+
+class Tracking(NamedTuple):
+    """`Tracking` holds the constants with which `terms.depth` and `terms.photometric` track surfaces."""
+
+    secants: int
+    max_step_m: Real
+    least_step_m: Real
+    flattest_share: Real
+    least_slope: Real
+    near_surface_m: Real
+    least_ray_cosine: Real
+    least_share: Real
+    least_depth_m: Real
+
+
+class Pixels(NamedTuple):
+    """`Pixels` are the fields of `terms.photometric_rows.PhotometricRows` and of its `RightView`."""
+
+    along_ray: Reals  # (3, N, M, R)
+    along_baseline: Reals  # (3, M, R)
+    intensity_left: Reals  # (N, M, R)
+    pixel_weight: Reals  # (M, R)
+    neighbour_weight: Reals  # (N, M, R)
+    right: Reals  # (A,)
+    frame: NDArray[np.int32]  # (M, 4)
+    to_full: Reals  # (M, 2)
+    crop: NDArray[np.int64]  # (M, 6)
+    in_front: Reals  # (M, 2)
+    covering: Reals  # (A, 2)
+
+
+class Matching(NamedTuple):
+    """A `Matching` holds the settings of the photometric norm and what an offset of the disparity does."""
+
+    lost_grey_levels: Real
+    huber_grey_levels: Real
+    # change of the inverse depth by the offset (B, S) of each car, and by a pixel of offset
+    inverse_depth: Reals
+    inverse_depth_per_px: Reals
+    centre: int  # which neighbour is the pixel itself

@@ -43,12 +43,11 @@ def without_kernels() -> Iterator[None]:
         _is_on.reset(token)
 
 
-def native_grid(field: object, bounds_obj: Tensor, *tensors: Tensor) -> arguments.Grid | None:
+def native_grid(field: object, *tensors: Tensor) -> arguments.Grid | None:
     """The grids of a field for native loops, if they take tensors like these at this place of the program, else None.
 
     Args:
         field: signed distances of the cars.
-        bounds_obj: (2, 3) of the prior, metres.
         tensors: what else a loop gets, at least one tensor of each origin.
     """
     # The compiler of tensor operations must see nothing else, and a subclass of the shape may look up anew.
@@ -56,9 +55,9 @@ def native_grid(field: object, bounds_obj: Tensor, *tensors: Tensor) -> argument
         return None
     if not _is_on.get() or not nothing_is_differentiated():
         return None
-    if not all(map(_is_fit, (field.values, field.basis, bounds_obj, *tensors))):
+    if not all(map(_is_fit, (field.values, field.basis, *tensors))):
         return None
-    return _grid(field, bounds_obj) if _is_installed() else None
+    return _grid(field) if _is_installed() else None
 
 
 def _is_fit(tensor: Tensor) -> bool:
@@ -76,24 +75,22 @@ def _is_installed() -> bool:
     return True
 
 
-def _grid(shape: GridShape, bounds_obj: Tensor) -> arguments.Grid:
+def _grid(shape: GridShape) -> arguments.Grid:
     x, y, _ = strides(shape)
-    lower, upper = (_point(bound) for bound in bounds_obj)
     return arguments.Grid(
         array(shape.values).reshape(-1),
         array(shape.basis).reshape(-1, shape.basis.shape[3]),
         np.uint64(shape.basis[..., 0].numel()),
         np.uint64(x),
         np.uint64(y),
-        _point(shape.last),
-        _point(shape.origin),
-        lower,
-        upper,
+        point(shape.last),
+        point(shape.origin),
         *map(np.float32, (shape.spacing_m, 1 / shape.spacing_m, ON_FACE, NO_STEP, BEYOND_GRIDS)),
     )
 
 
-def _point(numbers: Tensor) -> arguments.Point:
+def point(numbers: Tensor) -> arguments.Point:
+    """Three numbers for a loop."""
     x, y, z = map(np.float32, numbers.tolist())
     return x, y, z
 
@@ -102,6 +99,11 @@ def array(tensor: Tensor) -> NDArray[Any]:
     """The numbers of a tensor, in one piece; a loop writes into a tensor that is in one piece already."""
     array: NDArray[Any] = tensor.detach().contiguous().numpy()
     return array
+
+
+def room_like(tensor: Tensor) -> Tensor:
+    """A tensor in one piece for a loop to write into."""
+    return torch.empty(tensor.shape, dtype=tensor.dtype)
 
 
 def native_rays(rays: Rays, T_obj_cam: Tensor) -> arguments.Rays:

@@ -31,4 +31,4 @@ def loop(function: _FunctionT) -> _FunctionT:
 
 def step(function: _FunctionT) -> _FunctionT:
     """Compile a function that a loop calls."""
-    return cast(_FunctionT, numba.njit(nogil=True, error_model="numpy")(function))
+    return cast(_FunctionT, numba.njit(nogil=True, forceinline=True, error_model="numpy")(function))

@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from directshape_torch.kernels.arguments import ClosestOut, Grid, HitsOut, Index, Point, Rays, Real, Reals, Search
+from directshape_torch.kernels.arguments import ClosestArrays, Grid, HitsArrays, Index, Point, Rays, Real, Reals, Search
 from directshape_torch.kernels.grid import HALF, ONE, ZERO, between, plus, value_and_gradient_at, value_at
 from directshape_torch.kernels.jit import SOURCES, loop, step
-from directshape_torch.kernels.search import centre_of, closest_from, depth_next_to, direction_of, interval, vertex
+from directshape_torch.kernels.search import (
+    centre_of,
+    closest_from,
+    depth_next_to,
+    direction_of,
+    interval,
+    vertex,
+    write,
+)
 
 _FAR = np.float32(3e38)
 
@@ -22,16 +30,16 @@ def march(
     max_cells: int,
     probes: int,
     far_m: Real,
-    closest: ClosestOut,
-    hits: HitsOut,
+    closest: ClosestArrays,
+    hits: HitsArrays,
     _sources: int = SOURCES,
 ) -> None:
     """Write the closest points of all rays and the hits of the rays of the first `num_left` blocks."""
     depths, sdf = np.empty(num_samples, np.float32), np.empty(num_samples, np.float32)
     middle = (
-        HALF * (grid.lower[0] + grid.upper[0]),
-        HALF * (grid.lower[1] + grid.upper[1]),
-        HALF * (grid.lower[2] + grid.upper[2]),
+        HALF * (search.lower[0] + search.upper[0]),
+        HALF * (search.lower[1] + search.upper[1]),
+        HALF * (search.lower[2] + search.upper[2]),
     )
     for block in range(np.uint64(len(rays.owner))):
         car = np.uint64(rays.owner[block])
@@ -60,16 +68,11 @@ def march(
 
 
 @step
-def write(out: Reals, block: Index, row: Index, point: Point) -> None:
-    out[0, block, row], out[1, block, row], out[2, block, row] = point
-
-
-@step
 def sample(
     grid: Grid, search: Search, first: Index, centre: Point, direction: Point, depths: Reals, sdf: Reals
 ) -> bool:
     """Fill in the samples of a ray at the middles of equal parts of its interval; whether it crosses the bounds."""
-    crosses, near, far, _, _ = interval(grid, search, ZERO, centre, direction)
+    crosses, near, far, _, _ = interval(search, ZERO, centre, direction)
     count = len(depths)
     for s in range(count):
         depths[s] = near + (far - near) * ((np.float32(s) + HALF) / np.float32(count))

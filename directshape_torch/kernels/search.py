@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from directshape_torch.kernels.arguments import Grid, Index, Point, Rays, Real, Search
+from directshape_torch.kernels.arguments import Grid, Index, Point, Rays, Real, Reals, Search
 from directshape_torch.kernels.grid import (
     HALF,
     ONE,
@@ -48,6 +48,17 @@ def direction_of(rays: Rays, block: Index, row: Index, car: Index) -> Point:
 
 
 @step
+def write(out: Reals, block: Index, row: Index, point: Point) -> None:
+    """Write the coordinates of the point of a ray."""
+    out[0, block, row], out[1, block, row], out[2, block, row] = point
+
+
+@step
+def point_in(points: Reals, block: Index, row: Index) -> Point:
+    return points[0, block, row], points[1, block, row], points[2, block, row]
+
+
+@step
 def depth_next_to(centre: Point, direction: Point, point: Point) -> Real:
     """Depth at which a ray comes closest to a point."""
     return dot(plus(point, -ONE, centre), direction) / dot(direction, direction)
@@ -55,7 +66,7 @@ def depth_next_to(centre: Point, direction: Point, point: Point) -> Real:
 
 @step
 def away_from_zero(x: Real, least: Real) -> Real:
-    return np.float32(np.copysign(max(abs(x), least), x))
+    return np.copysign(max(abs(x), least), x)
 
 
 @step
@@ -67,11 +78,9 @@ def slab(lower: Real, upper: Real, centre: Real, direction: Real, least: Real) -
 
 
 @step
-def interval(
-    grid: Grid, search: Search, margin: Real, centre: Point, direction: Point
-) -> tuple[bool, Real, Real, Point, Point]:
+def interval(search: Search, margin: Real, centre: Point, direction: Point) -> tuple[bool, Real, Real, Point, Point]:
     """Whether a ray meets the bounds, from which to which depth, and depths of entry and exit for each axis."""
-    a, b, least = grid.lower, grid.upper, search.least_direction
+    a, b, least = search.lower, search.upper, search.least_direction
     enters_x, leaves_x = slab(a[0] + margin, b[0] - margin, centre[0], direction[0], least)
     enters_y, leaves_y = slab(a[1] + margin, b[1] - margin, centre[1], direction[1], least)
     enters_z, leaves_z = slab(a[2] + margin, b[2] - margin, centre[2], direction[2], least)
@@ -157,7 +166,7 @@ def closest_from(
     grid: Grid, search: Search, first: Index, centre: Point, direction: Point, start: Real, max_cells: int
 ) -> tuple[bool, Real, Point]:
     """Whether a ray crosses the bounds, and depth and face of its closest point near a start."""
-    crosses, near, far, enters, leaves = interval(grid, search, search.margin_m, centre, direction)
+    crosses, near, far, enters, leaves = interval(search, search.margin_m, centre, direction)
     if not crosses:
         return False, near, NOWHERE
     depth, face = minimum_along(grid, first, centre, direction, min(max(start, near), far), near, far, max_cells)

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from directshape_torch.compile import compilable
-from directshape_torch.kernels.arguments import ClosestOut, Grid, HitsOut, Search
-from directshape_torch.kernels.choice import array, native_grid, native_rays
+from directshape_torch.kernels.arguments import ClosestArrays, Grid, HitsArrays, Search, singles
+from directshape_torch.kernels.choice import array, native_grid, native_rays, point, room_like
 from directshape_torch.numerics.gradient_mode import as_constant
 from directshape_torch.numerics.records import Dense
 from directshape_torch.rows import LEAST_DIRECTION, ObjectRays, Rays
@@ -26,11 +26,11 @@ from directshape_torch.shape.field import Field
 # thousand of the rays near a contour is then more than 1 mm from its minimum; 5 % of the tracked rays are while a car
 # still moves by decimetres.
 _CELLS_OF_MARCH = 3
-_CELLS_WHEN_TRACKED = 2
+CELLS_WHEN_TRACKED = 2
 # The three samples about a tracked point have this distance.
-_SAMPLE_M = 0.2
+SAMPLE_M = 0.2
 # A minimum further away than this, in sample distances, lies in another cell; this is about the size of a cell.
-_NEXT_CELL = 0.5
+NEXT_CELL = 0.5
 # A smaller second difference of samples is only rounding, so their parabola is meaningless.
 _LEAST_SECOND_DIFFERENCE_M = 1e-6
 # Depths stay this far inside the prior's bounds, where the field has a kink and no derivative.
@@ -43,23 +43,22 @@ _PROBES = 8
 # A march on a CPU looks up this many points at once, so that 400 kB of coordinates stay in its caches.
 _POINTS_AT_ONCE = 32_768
 # One step moves a tracked depth by at most this much.
-_MAX_STEP_M = 0.3
+MAX_STEP_M = 0.3
 # A tracked depth takes this many secant steps before the Newton step that comes with the derivatives.
-_SECANTS = 1
+SECANTS = 1
 # From this signed distance a Newton step reaches the surface to a fraction of a millimetre.
 NEAR_SURFACE_M = 0.03
 # The ends of a step along the ray give a slope if the step is longer than this.
-_LEAST_STEP_M = 1e-3
+LEAST_STEP_M = 1e-3
 # The slope of a secant must have at least this share of the slope at the hit.
-_FLATTEST_SHARE = 0.2
+FLATTEST_SHARE = 0.2
 # Below this slope along the ray, per metre of depth, a tangent plane gives no useful depth and no derivative.
-_LEAST_SLOPE = 1e-3
+LEAST_SLOPE = 1e-3
 # Below this curvature, per metre, a minimum along the ray is so flat that its motion is meaningless.
 _LEAST_CURVATURE = 1e-6
 # A ray without a surface gets points at this coordinate, beyond every visible car.
 _FAR_M = 1e4
-SEARCH = Search(*map(np.float32, (_MARGIN_M, _AT_END_M, _LEAST_SECOND_DIFFERENCE_M, LEAST_DIRECTION)))
-"""These are the constants of native searches."""
+_SEARCH = singles(_MARGIN_M, _AT_END_M, _LEAST_SECOND_DIFFERENCE_M, LEAST_DIRECTION)
 
 
 class Closest(NamedTuple):
@@ -104,7 +103,7 @@ def marched_views(
     num_left = len(left.owner)
     grid = native_grid(field, bounds_obj, T_obj_cam, both.centre_cam, both.ray_cam)
     if grid is not None:
-        return _marched_natively(grid, both, num_left, num_samples, T_obj_cam)
+        return _marched_natively(grid, native_search(bounds_obj), both, num_left, num_samples, T_obj_cam)
     rays = both.in_objects(T_obj_cam)
     sampled = march(field, both.owner, rays, bounds_obj, num_samples)
     closest = closest_of_march(field, both.owner, rays, bounds_obj, sampled)
@@ -114,19 +113,22 @@ def marched_views(
     return closest, first_hits(field, left.owner, left_rays, sampled_left, closest_left)
 
 
+def native_search(bounds_obj: Tensor) -> Search:
+    """Bounds (2, 3) and constants of a native search."""
+    return Search(point(bounds_obj[0]), point(bounds_obj[1]), *_SEARCH)
+
+
 def _marched_natively(
-    grid: Grid, rays: Rays, num_left: int, num_samples: int, T_obj_cam: Tensor
+    grid: Grid, search: Search, rays: Rays, num_left: int, num_samples: int, T_obj_cam: Tensor
 ) -> tuple[Closest, Hits]:
     from directshape_torch.kernels.march import march  # Numba may be missing.
 
-    depth = torch.empty_like(rays.ray_cam[0])
-    points, is_there = torch.empty_like(rays.ray_cam), torch.empty_like(depth, dtype=torch.bool)
-    closest = Closest(points, depth, is_there, torch.empty_like(points))
-    of_left = points[:, :num_left]
-    hits = Hits(*map(torch.empty_like, (of_left, of_left, is_there[:num_left], depth[:num_left])))
-    into = ClosestOut(*map(array, closest)), HitsOut(*map(array, hits))
+    points = rays.ray_cam
+    closest = Closest(*map(room_like, (points, points[0], points[0].bool(), points)))
+    hits = Hits(*(room_like(closest[n][..., :num_left, :]) for n in (0, 0, 2, 1)))
+    into = ClosestArrays(*map(array, closest)), HitsArrays(*map(array, hits))
     counts = num_samples, _CELLS_OF_MARCH, _PROBES
-    march(grid, SEARCH, native_rays(rays, T_obj_cam), np.uint64(num_left), *counts, np.float32(_FAR_M), *into)
+    march(grid, search, native_rays(rays, T_obj_cam), np.uint64(num_left), *counts, np.float32(_FAR_M), *into)
     return closest, hits
 
 
@@ -174,12 +176,12 @@ def closest_of_march(field: Field, owner: Tensor, rays: ObjectRays, bounds_obj: 
 def tracked_closest(field: Field, rays: Rays, in_objects: ObjectRays, bounds_obj: Tensor, before: Closest) -> Closest:
     """The point of closest approach of every ray, near its closest point at a nearby state."""
     next_to = in_objects.depth_next_to(before.points_obj)
-    samples = torch.stack([next_to - _SAMPLE_M, next_to, next_to + _SAMPLE_M])
+    samples = torch.stack([next_to - SAMPLE_M, next_to, next_to + SAMPLE_M])
     sdf = field.sdf(in_objects.at(samples), rays.owner, inside=True)
     vertex = _vertex(sdf[0], sdf[1], sdf[2], 1.0)
     # The start moves only to a minimum in another cell, so that a nearby minimum remains the selected one.
-    start = torch.add(next_to, vertex * (vertex.abs() > _NEXT_CELL), alpha=_SAMPLE_M)
-    now = _closest_from(field, rays.owner, in_objects, bounds_obj, start, _CELLS_WHEN_TRACKED)
+    start = torch.add(next_to, vertex * (vertex.abs() > NEXT_CELL), alpha=SAMPLE_M)
+    now = _closest_from(field, rays.owner, in_objects, bounds_obj, start, CELLS_WHEN_TRACKED)
     # A ray that misses the bounds keeps its last point.
     return now._replace(points_obj=torch.where(now.crosses, now.points_obj, before.points_obj))
 
@@ -289,28 +291,28 @@ def tracked_depth(field: Field, rays: Rays, in_objects: ObjectRays, before: Hits
     they find no surface, the depth is meaningless, which a large signed distance at this depth shows.
     """
     slope = (before.normal_obj * in_objects.direction_obj).sum(0)
-    slope = torch.where(slope.abs() > _LEAST_SLOPE, slope, torch.full_like(slope, -_LEAST_SLOPE))
+    slope = torch.where(slope.abs() > LEAST_SLOPE, slope, torch.full_like(slope, -LEAST_SLOPE))
     to_plane = ((before.points_obj - in_objects.centre_obj) * before.normal_obj).sum(0) / slope
     next_to = in_objects.depth_next_to(before.points_obj)
-    depth = next_to + (to_plane - next_to).clamp(-_MAX_STEP_M, _MAX_STEP_M)
+    depth = next_to + (to_plane - next_to).clamp(-MAX_STEP_M, MAX_STEP_M)
     sdf = field.sdf(in_objects.at(depth), rays.owner, inside=True)
     # The old slope belongs to another point, so after a long step of the car further secants are needed.
-    for _ in range(_SECANTS):
-        step = -(sdf / slope).clamp(-_MAX_STEP_M, _MAX_STEP_M)
+    for _ in range(SECANTS):
+        step = -(sdf / slope).clamp(-MAX_STEP_M, MAX_STEP_M)
         depth = depth + step
         before_sdf, sdf = sdf, field.sdf(in_objects.at(depth), rays.owner, inside=True)
         slope = _secant_slope(step, before_sdf, sdf, slope)
-    return depth - (sdf / slope).clamp(-_MAX_STEP_M, _MAX_STEP_M)
+    return depth - (sdf / slope).clamp(-MAX_STEP_M, MAX_STEP_M)
 
 
 def _secant_slope(step: Tensor, sdf_before: Tensor, sdf: Tensor, slope: Tensor) -> Tensor:
     """Slope along the ray (M, R) between the last two points; the given slope where they determine none."""
     # Two points on opposite sides of the surface determine a slope at any distance. Where the slope jumps at the face
     # of a cell, the given slope would lead back to the previous point again and again.
-    tells = (step.abs() > _LEAST_STEP_M) | (sdf * sdf_before < 0)
+    tells = (step.abs() > LEAST_STEP_M) | (sdf * sdf_before < 0)
     secant = (sdf - sdf_before) / torch.where(tells, step, torch.ones_like(step))
     # The secant must enter the shape and be steep enough to avoid a huge next step.
-    return torch.where(tells & (secant < _FLATTEST_SHARE * slope) & (slope < 0), secant, slope)
+    return torch.where(tells & (secant < FLATTEST_SHARE * slope) & (slope < 0), secant, slope)
 
 
 def surface_depth(field: Field, owner: Tensor, rays: ObjectRays, depth: Tensor, usable: Tensor) -> Tensor:
@@ -322,7 +324,7 @@ def surface_depth(field: Field, owner: Tensor, rays: ObjectRays, depth: Tensor, 
     for _ in range(2):
         at = field.derivatives(rays.at(depth), owner)
         slope = (at.gradient * rays.direction_obj).sum(0)
-        regular = usable & (slope.abs() > _LEAST_SLOPE)
+        regular = usable & (slope.abs() > LEAST_SLOPE)
         step = at.value / torch.where(regular, slope, torch.ones_like(slope))
         depth = depth - torch.where(regular, step, torch.zeros_like(step))
     return depth

@@ -18,7 +18,9 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import PhotometricConfig, StageConfig
-from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
+from directshape_torch.kernels.arguments import Matching, Pixels, SurfaceArrays, Tracking, singles
+from directshape_torch.kernels.choice import array, native_grid, native_rays, room_like
+from directshape_torch.numerics.gradient_mode import map_tensors, nothing_is_differentiated
 from directshape_torch.numerics.records import Dense
 from directshape_torch.numerics.tables import Table
 from directshape_torch.numerics.tensors import length, occurrences
@@ -28,8 +30,20 @@ from directshape_torch.shape.field import Field
 from directshape_torch.state.cars import CarBatch
 from directshape_torch.state.unknowns import CODE, OFFSET, POSE, State
 from directshape_torch.terms import robust
-from directshape_torch.terms.depth import NEAR_SURFACE_M, Hits, surface_depth, tracked_depth
+from directshape_torch.terms.depth import (
+    FLATTEST_SHARE,
+    LEAST_SLOPE,
+    LEAST_STEP_M,
+    MAX_STEP_M,
+    NEAR_SURFACE_M,
+    SECANTS,
+    Hits,
+    surface_depth,
+    tracked_depth,
+)
 from directshape_torch.terms.photometric_rows import (
+    CENTRE,
+    LEAST_DEPTH_M,
     LeftPixels,
     PhotometricRows,
     compared,
@@ -37,7 +51,7 @@ from directshape_torch.terms.photometric_rows import (
     warped_pixels,
 )
 from directshape_torch.terms.silhouette import sdf_state_jacobian
-from directshape_torch.terms.term import Linear, Prepared, Term
+from directshape_torch.terms.term import Linear, Part, Prepared, Term, part_to_write
 
 Brightness = Literal["none", "gain", "affine"]
 
@@ -49,6 +63,9 @@ _LEAST_CONTRAST = 5.0
 _LEAST_RAY_COSINE = 0.1
 # An offset must leave at least this share of a disparity, because points beyond infinity are invisible.
 _LEAST_SHARE = 1e-3
+# These are the constants of native rows.
+_OF_TRACKING = MAX_STEP_M, LEAST_STEP_M, FLATTEST_SHARE, LEAST_SLOPE, NEAR_SURFACE_M
+_TRACKING = Tracking(SECANTS, *singles(*_OF_TRACKING, _LEAST_RAY_COSINE, _LEAST_SHARE, LEAST_DEPTH_M))
 
 
 class PixelSet(NamedTuple):
@@ -172,6 +189,28 @@ class Photometric(Term[Surface]):
         residual = torch.where(usable[..., None], compare.residual, self.config.lost_grey_levels)
         J = torch.where(usable[..., None], compare.J_residual_depth, 0.0)
         return Linear(residual, J, J_depth_state, surface.seen(anchor, depth, usable))
+
+    def native_part(self, field: Field, state: State, anchor: Surface) -> Part[Surface] | None:
+        rows = self.pixel_set.rows
+        seen = rows.along_ray, rows.intensity_left, rows.pixel_weight, rows.neighbour_weight, rows.right.pixels
+        grid = native_grid(field, state.T_obj_cam, rows.rays.ray_cam, anchor.points_obj, *seen)
+        if grid is None:
+            return None
+        from directshape_torch.kernels.photometric import photometric  # Numba may be missing.
+
+        config, offset = self.config, state.offset_px
+        shape = *rows.pixel_weight.shape, len(rows.intensity_left)
+        part, sums = part_to_write(self, state, map_tensors(room_like, anchor), shape)
+        of_offset = (
+            self.cars.inverse_depth_of_offset(x) if x.shape[1] else x for x in (offset, torch.ones_like(offset))
+        )
+        lost, corner = singles(config.lost_grey_levels, config.huber_grey_levels)
+        of_inverse_depth, per_px = map(array, of_offset)
+        matching = Matching(lost, corner, of_inverse_depth, per_px, CENTRE)
+        pixels = Pixels(*map(array, (*rows[1:-1], *rows.right)))
+        before, now = (SurfaceArrays(*map(array, surface)) for surface in (anchor, part.anchor))
+        photometric(grid, _TRACKING, matching, native_rays(rows.rays, state.T_obj_cam), pixels, before, now, sums)
+        return part
 
     def residual(self, field: Field, state: State, anchor: Surface) -> Tensor:
         rows = self.pixel_set.rows

@@ -28,7 +28,7 @@ CENTRE = DSO_PATTERN.index((0, 0))
 # This is c of the gradient weight c^2 / (c^2 + |grad I_l|^2) (DSO), in grey levels per pixel.
 GRADIENT_CONSTANT = 50.0
 # The right camera sees only points with at least this depth.
-_LEAST_DEPTH_M = 1e-6
+LEAST_DEPTH_M = 1e-6
 
 
 @made_once
@@ -216,7 +216,7 @@ def warped_pixels(rows: PhotometricRows, depth: Tensor) -> Warped:
     """The neighbours of pixels at depths (..., M, 64), looked up where they land."""
     depth = depth.unsqueeze(-3)
     x, y, z = (torch.addcmul(at, along, depth) for at, along in zip(rows.along_baseline, rows.along_ray, strict=True))
-    in_front = z > _LEAST_DEPTH_M
+    in_front = z > LEAST_DEPTH_M
     inverse = 1 / torch.where(in_front, z, 1.0)
     u, v = x * inverse, y * inverse
     first_pixel, row_step, last_column, last_row = rows.right.frame.mT[..., None]

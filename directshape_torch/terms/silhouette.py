@@ -21,7 +21,9 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from directshape_torch.config import SilhouetteConfig, StageConfig
-from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
+from directshape_torch.kernels.arguments import ClosestArrays, Contour, singles
+from directshape_torch.kernels.choice import array, native_grid, native_rays, room_like
+from directshape_torch.numerics.gradient_mode import map_tensors, nothing_is_differentiated
 from directshape_torch.numerics.records import Dense
 from directshape_torch.numerics.tables import Table, take_rows
 from directshape_torch.rows import Blocks, CarSums, PixelSamples, Rays, Rows
@@ -31,14 +33,18 @@ from directshape_torch.state.cars import CarBatch
 from directshape_torch.state.unknowns import State
 from directshape_torch.terms import robust
 from directshape_torch.terms.depth import (
+    CELLS_WHEN_TRACKED,
+    NEXT_CELL,
+    SAMPLE_M,
     Closest,
     along_face,
     attached_closest_depth,
     march,
+    native_search,
     sample_depths,
     tracked_closest,
 )
-from directshape_torch.terms.term import AnchorT, Linear, Prepared, Term
+from directshape_torch.terms.term import AnchorT, Linear, Part, Prepared, Term, part_to_write
 
 # Zeta stays within these bounds, per metre.
 ZETA_BOUNDS = (4.0, 400.0)
@@ -52,6 +58,8 @@ IN_PLAY_EXPONENT = 8.0
 _IN_PLAY_MARGIN_M = 0.2
 # After a stage with a wider contour the remaining motion is small, so zeta times the margin is at most this.
 _MARGIN_EXPONENT_AFTER_WIDER = 10.0
+# These are the constants of native rows.
+_CONTOUR = *singles(SATURATION, _RESIDUAL_FLOOR, SAMPLE_M, NEXT_CELL), CELLS_WHEN_TRACKED
 
 
 @dataclass(frozen=True)
@@ -216,6 +224,22 @@ class Silhouettes(OfMasks[Closest]):
         gradient = along_face(at.gradient, rays.direction_obj, now.face_obj)
         residual, J_residual_sdf = self._of_distance(at.value, now.crosses)
         return Linear(residual[..., None], J_residual_sdf[..., None], sdf_state_jacobian(points, gradient, at), now)
+
+    def native_part(self, field: Field, state: State, anchor: Closest) -> Part[Closest] | None:
+        rays, foreground, zeta = self.rows.rays, self.rows.foreground, self.zeta
+        grid = native_grid(field, self.bounds_obj, state.T_obj_cam, rays.ray_cam, foreground, zeta, anchor.points_obj)
+        if grid is None:
+            return None
+        from directshape_torch.kernels.silhouettes import silhouettes  # Numba may be missing.
+
+        part, sums = part_to_write(self, state, map_tensors(room_like, anchor), (*foreground.shape, 1))
+        masks = map(array, (foreground, self.rows.filled, zeta))
+        contour = Contour(*(*masks, *_CONTOUR))
+        before, now = (ClosestArrays(*map(array, closest)) for closest in (anchor, part.anchor))
+        silhouettes(
+            grid, native_search(self.bounds_obj), native_rays(rays, state.T_obj_cam), contour, before, now, sums
+        )
+        return part
 
     def residual(self, field: Field, state: State, anchor: Closest) -> Tensor:
         rays = self.rows.rays.in_objects(state.T_obj_cam)

@@ -16,6 +16,8 @@ from torch import Tensor
 
 from directshape_torch.compile import compilable
 from directshape_torch.config import StageConfig
+from directshape_torch.kernels.arguments import Sums
+from directshape_torch.kernels.choice import array
 from directshape_torch.numerics.tables import Table
 from directshape_torch.rows import Blocks, CarSums
 from directshape_torch.shape.field import Field, field_of
@@ -148,6 +150,10 @@ class Term(Table, Protocol[AnchorT]):
         """
         ...
 
+    def native_part(self, field: Field, state: State, anchor: AnchorT) -> Part[AnchorT] | None:
+        """The part that `part_of` gives without `fisher`, by a native loop; None where none is taken."""
+        return None
+
     def residual(self, field: Field, state: State, anchor: AnchorT) -> Tensor:
         """Differentiable residuals (M, R, N) at a state close to the one whose `linear` gave `anchor`."""
         ...
@@ -169,6 +175,18 @@ class Part(NamedTuple, Generic[AnchorT]):
     information: Tensor  # (M, D, D) the Fisher matrix, or without `fisher` the Gauss-Newton matrix
     residual: Tensor  # (M, R, N)
     anchor: AnchorT  # the points at which the residuals were taken
+
+
+def part_to_write(
+    term: Term[AnchorT], state: State, anchor: AnchorT, shape: tuple[int, int, int]
+) -> tuple[Part[AnchorT], Sums]:
+    """A part with residuals of a shape (M, R, N), and where a native loop writes it, block by block."""
+    size = state.unknowns.size
+    products = torch.zeros(shape[0], size + 1, size, dtype=torch.float64)
+    cost, residual = torch.empty(shape[0], dtype=torch.float64), torch.empty(shape, dtype=state.code.dtype)
+    first = state.unknowns.span(*term.sees).start
+    part = Part(cost, products, products[:, :-1], residual, anchor)
+    return part, Sums(array(cost), array(products), array(residual), first)
 
 
 def linear_of(term: Term[AnchorT], field: Field, state: State, anchor: AnchorT) -> Linear[AnchorT]:
@@ -213,8 +231,12 @@ def parts_of(
     terms: tuple[AnyTerm, ...], field: Field, state: State, anchors: tuple[object, ...], fisher: bool = True
 ) -> tuple[Part[Any], ...]:
     """The parts of all terms at a state, with hand-derived Jacobians, near their anchors."""
-    ats = [linear_of(term, field, state, anchor) for term, anchor in zip(terms, anchors, strict=True)]
-    return tuple(part_of(term, at, fisher) for term, at in zip(terms, ats, strict=True))
+
+    def of(term: AnyTerm, anchor: object) -> Part[Any]:
+        native = None if fisher else term.native_part(field, state, anchor)
+        return native or part_of(term, linear_of(term, field, state, anchor), fisher)
+
+    return tuple(map(of, terms, anchors))
 
 
 def weighted_products(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import directshape_torch
 from directshape_torch.errors import InputError
 from directshape_torch.io.stereo_dataset import LoadedFrame
 
-_DETECTORS = {"rendered": "stereo", "kitti": "noisy_stereo"}
+_DETECTORS = {"rendered": "stereo", "kitti": "noisy_stereo", "kitti15": "noisy_stereo"}
+_SCENES = "rendered", "kitti"
 
 
 @dataclass(frozen=True)
@@ -21,22 +23,27 @@ class Scene:
     frames: tuple[LoadedFrame, ...]
 
 
-def load_scenes(data_root: Path | None, max_frames: int | None = None) -> tuple[Scene, ...]:
+def load_scenes(
+    data_root: Path | None, max_frames: int | None = None, names: Sequence[str] = _SCENES
+) -> tuple[Scene, ...]:
     """The rendered and the KITTI frames below a data folder, or the bundled demo frame without a folder.
 
     Args:
-        data_root: folder with `rendered` or `kitti` (DIRECTSHAPE_DATA), or None.
+        data_root: folder with data sets (DIRECTSHAPE_DATA), or None.
         max_frames: number of first frames of each data set; None for all.
+        names: the data sets.
 
     Raises:
-        InputError: the folder has neither.
+        InputError: the folder has none of them.
     """
     if data_root is None:
         return (demo_scene(),)
-    found = [(data_root / name, detector) for name, detector in _DETECTORS.items() if (data_root / name).is_dir()]
+    found = [(data_root / name, _DETECTORS[name]) for name in names if (data_root / name).is_dir()]
     if not found:
         cure = "or leave both out for the bundled frame"
-        raise InputError("--data or DIRECTSHAPE_DATA", "a folder that holds rendered or kitti", str(data_root), cure)
+        raise InputError(
+            "--data or DIRECTSHAPE_DATA", f"a folder that holds {' or '.join(names)}", str(data_root), cure
+        )
     return tuple(_scene(root, detector, max_frames) for root, detector in found)
 
 

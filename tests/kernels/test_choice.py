@@ -16,12 +16,12 @@ from helpers.ellipsoids import ellipsoid_prior
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from directshape_torch.kernels import choice, jit, march
+from directshape_torch.kernels import choice, jit, march, photometric, silhouettes
 from directshape_torch.kernels.choice import native_grid, without_kernels
 from directshape_torch.shape.field import PackedField
 from directshape_torch.shape.sdf_grid import GridShape
 
-LOOPS = (march.march,)
+LOOPS = march.march, silhouettes.silhouettes, photometric.photometric
 
 
 @pytest.fixture

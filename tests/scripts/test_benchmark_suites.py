@@ -9,7 +9,7 @@ from pathlib import Path
 import benchmark
 import pytest
 import torch
-from benchmark_suites import checkouts, stage_profile, times
+from benchmark_suites import checkouts, native_loops, stage_profile, times
 from benchmark_suites.measures import count_operations, peak_tensor_bytes
 from benchmark_suites.stage_profile import PARTS, profile_parts
 from benchmark_suites.timing import Row, Spread, time_interleaved
@@ -134,7 +134,7 @@ def test_no_part_of_a_refinement_is_empty_and_they_add_up() -> None:
     operations = [int(row.note.split()[2]) for row in parts]
     assert min(operations) > 0
     assert f"{sum(operations)} operations" == whole.note
-    assert operations[-1] < 0.05 * sum(operations)
+    assert operations[-1] < 0.1 * sum(operations)
 
 
 # --- other versions
@@ -145,3 +145,14 @@ def test_a_version_against_itself() -> None:
     assert [row.name.split(", ")[-1] for row in rows] == ["time", "operations"]
     assert 0.2 < rows[0].spread.median < 5
     assert rows[1].spread.median == 1
+
+
+# --- native loops
+
+
+def test_native_loops_against_tensor_operations() -> None:
+    rows: list[Row] = list(native_loops.native_rows(None, quick=True))
+    assert [row.name.split(", ")[-1] for row in rows] == ["time", "mm between ends"]
+    assert rows[0].spread.median < 1
+    assert 0 < rows[1].spread.median < 0.1
+    assert rows[1].spread.count == 6

@@ -1,0 +1,37 @@
+"""This module sums weighted products of Jacobians over the rows of a block, as `terms.term.part_of` does."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from directshape_torch.kernels.arguments import Grid, Index, Point, Real, Reals, Sums
+from directshape_torch.kernels.grid import code_derivative_in, scaled
+from directshape_torch.kernels.jit import step
+
+
+@step
+def write_jacobian(grid: Grid, node: Index, place: Point, point: Point, gradient: Point, scale: Real, J: Reals) -> None:
+    """Write `scale J_sdf_state` (`terms.silhouette.sdf_state_jacobian`), of pose and code."""
+    (x, y, z), (u, v, w) = point, scaled(gradient, scale)
+    J[0], J[1], J[2] = u, v, w
+    J[3], J[4], J[5] = y * w - z * v, z * u - x * w, x * v - y * u
+    code_derivative_in(grid, node, place, scale, J[6:])
+
+
+@step
+def write_weighted(J: Reals, hessian_weight: Real, gradient_weight: Real, weighted: Reals) -> None:
+    """Write the columns with which the Jacobian of a row is multiplied, of the matrix and, last, of the gradient."""
+    for k in range(len(J)):
+        weighted[k] = hessian_weight * J[k]
+    weighted[len(J)] = gradient_weight
+
+
+@step
+def write_products(weighted: Reals, J: Reals, block: Index, out: Sums) -> None:
+    """Write matrix and gradient of a block, from its rows (R, C + 1) and (R, C)."""
+    products, into = np.dot(weighted.T, J), out.products[block]
+    count, last = J.shape[1], into.shape[0] - 1
+    for i in range(count):
+        for k in range(count):
+            into[out.first + i, out.first + k] = products[i, k]
+        into[last, out.first + i] = products[count, i]
