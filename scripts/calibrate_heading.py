@@ -34,7 +34,7 @@ from directshape_torch.status import Status
 
 Array = NDArray[np.float64]
 SCALES = np.geomspace(0.001, 2.0, 200)
-BINS = (0.0, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
+BINS = (0.0, 0.9, 0.95, 1.0)
 _SAME_AXIS_DEG, _NEAR_M = 25.0, 20.0
 
 

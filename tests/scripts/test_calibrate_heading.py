@@ -33,7 +33,7 @@ def test_a_probability_gives_its_difference_back() -> None:
 
 def test_the_table_has_predicted_beside_true_shares() -> None:
     table = reliability([Cars("a", "b", np.zeros(4), np.array([True, True, True, False]), np.zeros(4))], [0.1], "")
-    assert table.splitlines()[-1].startswith("| a b | 4 | 0.75 | 0.75 (4) | 0.69 |  (0) | 0.50, 0.75 (4) |")
+    assert table.splitlines()[-1].startswith("| a b | 4 | 0.75 | 0.75 (4) | 0.69 | 0.50, 0.75 (4) |")
 
 
 def test_the_demo_from_its_masks_is_judged(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
