@@ -35,11 +35,15 @@ def detections_of_masks(
     masks = distinct(masks)
     left = [mask for mask in masks if mask.side == "left" and mask.is_car]
     score = torch.tensor([mask.score for mask in left], dtype=dtype)
-    found = Detections.from_masks(frame, mask_crops(left, size_hw, dtype), score=score)
+    crops = mask_crops(left, size_hw, dtype)
+    found = Detections.from_masks(frame, crops, score=score)
     outlines = box_outlines(found.T_cam_obj, found.dimensions_hwl, frame.camera)
     right = right_masks(left, masks, outlines, size_hw)
     occluders = occluders_among(masks, [*left, *right], {}, size_hw, dtype)
-    detections = replace(found, mask_right=mask_crops(right, size_hw, dtype), occluders=occluders)
+    # Rows that a left mask lost, because they show no car, are the same rows in the right image.
+    end = torch.where(found.mask_left.boxes[:, 3] < crops.boxes[:, 3], found.mask_left.boxes[:, 3], height)
+    mask_right = mask_crops(right, size_hw, dtype).above(end)
+    detections = replace(found, mask_right=mask_right, occluders=occluders)
     tracks = tuple(mask.track_id for mask in left)
     objects = _lines(detections, frame.camera.t_cam_ref[0])
     return FrameDetections(detections, tuple(range(len(left))), tracks, ("",) * len(left)), objects

@@ -194,6 +194,14 @@ class MaskCrops(TensorRecord):
         values = torch.cat(parts) if parts else self.values[:0]
         return type(self)(values, self.boxes * present[:, None].to(self.boxes), self.size_hw)
 
+    def above(self, end: Tensor) -> Self:
+        """The masks without what lies in row `end` (B,) of the image or below it."""
+        boxes = self.boxes.clone()
+        boxes[:, 3] = boxes[:, 3].minimum(end.to(boxes)).maximum(boxes[:, 1])
+        heights = (boxes[:, 3] - boxes[:, 1]).tolist()
+        parts = [self.crop(row)[:height].reshape(-1) for row, height in enumerate(heights)]
+        return type(self)(torch.cat(parts) if parts else self.values, boxes, self.size_hw)
+
     def padded(self, size_hw: tuple[int, int]) -> Self:
         """The masks in images that are padded at the right and bottom."""
         return type(self)(self.values, self.boxes, size_hw)

@@ -13,7 +13,13 @@ from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.scene.masks import MaskCrops
-from directshape_torch.start.mask_points import MaskPoints, depth_noise, height_above_ground, points_under
+from directshape_torch.start.mask_points import (
+    MaskPoints,
+    depth_noise,
+    height_above_ground,
+    points_under,
+    rows_of_height,
+)
 from directshape_torch.start.rectangle_fit import MEAN_HWL, InstancePoints, distance_outside, fit_rectangles, outline_of
 from directshape_torch.start.seen_ends import ends_seen
 from directshape_torch.stereo_matching.disparity import with_disparity
@@ -26,6 +32,8 @@ _REACH_M = 4.5
 _BAND_M, _OFF_BAND_WEIGHT = (0.25, 1.0), 0.1
 # Height and width in the image, and distance, that the mask of a car can have.
 _HEIGHT_M, _WIDTH_M, _DEPTH_M = (0.4, 2.4), (0.5, 6.5), (2.0, 80.0)
+# A mask higher than a passenger car shows a mirror image below the road, which may be known as badly as this.
+_CAR_HEIGHT_M, _ROAD_M = 2.0, 0.2
 # Median height of a car's points above the road, which may be known badly, and median deviation from it.
 _MIDDLE_M, _SPREAD_M = (-0.5, 2.0), (0.08, 1.0)
 # Of the points under the mask of one car at most this share lies beside its rectangle, by this distance and their
@@ -52,6 +60,11 @@ def start_boxes(
     _check_frame_index(frame_index, len(frames))
     frames = with_disparity(frames, needed=frame_index)
     under = points_under(frames, mask_left, frame_index)
+    end = _mirrored_rows(frames, mask_left, frame_index, under.points_cam)
+    if bool((end < mask_left.size_hw[0]).any()):
+        with torch.enable_grad():  # Masks may have gradients.
+            mask_left, mask_right = mask_left.above(end), mask_right.above(end)
+        under = points_under(frames, mask_left, frame_index)
     seen = _near_each_other(under)
     above = height_above_ground(seen.points_cam, frames, frame_index)
     places, costs = _placed(frames, mask_left, frame_index, seen, above)
@@ -78,6 +91,18 @@ def start_boxes(
 def _check_frame_index(frame_index: Tensor, num_frames: int) -> None:
     if len(frame_index) and not 0 <= int(frame_index.min()) <= int(frame_index.max()) < num_frames:
         raise InputError("frame_index", f"0..{num_frames - 1}", f"{frame_index.min()}..{frame_index.max()}")
+
+
+def _mirrored_rows(frames: FrameBatch, masks: MaskCrops, frame_index: Tensor, points_cam: Tensor) -> Tensor:
+    """The first row (M,) that shows no car but its mirror image, where a mask is higher than a car; else the last.
+
+    A wet road mirrors a car at the car's own depth, so that it seems to go on below the road.
+    """
+    extents, focal = masks.extents, frames.camera.K_left[frame_index, 1, 1]
+    height_m = (extents[:, 3] - extents[:, 1]) * points_cam[..., 2].nanmedian(dim=1).values / focal
+    road = rows_of_height(frames, frame_index, points_cam, -_ROAD_M)
+    is_mirrored = (height_m > _CAR_HEIGHT_M) & (road < extents[:, 3])  # NaN is not
+    return torch.where(is_mirrored, road, masks.size_hw[0]).clamp_min(0).long()
 
 
 def _near_each_other(seen: MaskPoints) -> MaskPoints:
@@ -166,9 +191,9 @@ def _is_one_car(frames: FrameBatch, masks: MaskCrops, frame_index: Tensor, point
     """Whether (M,) a rectangle explains the points (M, P, 3) under its mask, and the columns of the mask."""
     off = distance_outside(place, points_cam[..., 0::2])
     is_beside = off > _BESIDE_M + depth_noise(frames, frame_index, points_cam[..., 2])  # NaN is not above it
-    share = is_beside.sum(dim=1) / off.isfinite().sum(dim=1)
+    explained = is_beside.sum(dim=1) <= _BESIDE_SHARE * off.isfinite().sum(dim=1)
     beyond = (outline_of(place) - _outline(frames, masks, frame_index)) * place[:, 1:2]
-    return (share <= _BESIDE_SHARE) & (beyond[:, 0] <= _BEYOND_M) & (-beyond[:, 1] <= _BEYOND_M)
+    return explained & (beyond[:, 0] <= _BEYOND_M) & (-beyond[:, 1] <= _BEYOND_M)
 
 
 def _facing(x: Tensor, z: Tensor, heading: Tensor) -> Tensor:

@@ -15,6 +15,8 @@ from directshape_torch.scene.masks import MASK_THRESHOLD, MaskCrops
 _MOST_PIXELS, _MOST_POINTS = 1600, 200
 # Disparities below this are of objects beyond every car, or wrong.
 _LEAST_DISPARITY_PX = 2.0
+# This share of the points may be nearer than all of the car.
+_NEAREST_SHARE = 0.1
 # Disparities on glass and paint are off by as much as this.
 _NOISE_PX = 0.5
 
@@ -58,6 +60,21 @@ def height_above_ground(points_cam: Tensor, frames: FrameBatch, frame_index: Ten
     """Heights (M, P) of points (M, P, 3) above the road, metres."""
     normal, offset = (each[frame_index] for each in (frames.ground.normal, frames.ground.offset))
     return (points_cam * normal[:, None]).sum(-1) + offset[:, None]
+
+
+def nearest_depth(points_cam: Tensor) -> Tensor:
+    """The depth (M,) of the nearest of the points (M, P, 3) but for a few that may be wrong, metres."""
+    # An empty tensor has no quantiles.
+    return points_cam[..., 2].nanquantile(_NEAREST_SHARE, dim=1) if len(points_cam) else points_cam[:, 0, 2]
+
+
+def rows_of_height(frames: FrameBatch, frame_index: Tensor, points_cam: Tensor, height_m: float) -> Tensor:
+    """The rows (M,) in which something at a height above the road is seen, where the nearest points (M, P, 3) are."""
+    K, depth = frames.camera.K_left[frame_index], nearest_depth(points_cam)
+    normal, offset = (each[frame_index] for each in (frames.ground.normal, frames.ground.offset))
+    x = points_cam[..., 0].nanmedian(dim=1).values
+    y = (height_m - normal[:, 0] * x - normal[:, 2] * depth - offset) / normal[:, 1]
+    return K[:, 1, 2] + K[:, 1, 1] * y / depth
 
 
 def depth_noise(frames: FrameBatch, frame_index: Tensor, depth: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from torch import Tensor
 from directshape_torch.geometry.stereo_depth import points_from_disparity
 from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.scene.masks import MASK_THRESHOLD, MaskCrops
-from directshape_torch.start.mask_points import depth_noise, height_above_ground
+from directshape_torch.start.mask_points import depth_noise, height_above_ground, nearest_depth, rows_of_height
 
 # The mask is cut off where it comes this near to the border of the image.
 _BORDER_PX = 2
@@ -16,7 +16,7 @@ _BORDER_PX = 2
 _NUM_ROWS, _BESIDE_PX = 12, (3, 6)
 # It hides an end of the car where this share of the rows shows something that is nearer than nearly all points of the
 # car, and so high above the road that it is not the road.
-_HIDING_SHARE, _NEAREST_SHARE, _LEAST_HEIGHT_M = 0.2, 0.1, 0.3
+_HIDING_SHARE, _LEAST_HEIGHT_M = 0.2, 0.3
 # Where depths are as uncertain as half the width of a car, columns tell more of its place, even if they may be hidden.
 _LARGEST_NOISE_M = 0.8
 
@@ -30,24 +30,14 @@ def ends_seen(
     """Whether (M, 2) the outer columns of masks are ends of cars, and not cut off by the image or a nearer object."""
     columns, width = masks.extents[:, 0::2], frames.sizes[frame_index, 1:]
     is_inside = torch.cat([columns[:, :1] > _BORDER_PX, columns[:, 1:] < width - _BORDER_PX], dim=1)
-    if not len(masks):
-        return is_inside
-    nearest = points_cam[..., 2].nanquantile(_NEAREST_SHARE, dim=1)
+    nearest = nearest_depth(points_cam)
     noise = depth_noise(frames, frame_index, nearest)
-    points, is_own = _beside(frames, masks, frame_index, _road_rows(frames, frame_index, points_cam, nearest))
+    # Nothing of a car is below the row at which its nearest end stands on the road.
+    points, is_own = _beside(frames, masks, frame_index, rows_of_height(frames, frame_index, points_cam, 0.0))
     above = height_above_ground(points.flatten(1, 3), frames, frame_index).view(is_own.shape)
     is_nearer = points[..., 2] < (nearest - noise)[:, None, None, None]
     hides = (is_nearer & ~is_own & (above > _LEAST_HEIGHT_M)).any(dim=3).to(noise).mean(dim=2) > _HIDING_SHARE
     return is_inside & ~(hides & (noise < _LARGEST_NOISE_M)[:, None])
-
-
-def _road_rows(frames: FrameBatch, frame_index: Tensor, points_cam: Tensor, depth: Tensor) -> Tensor:
-    """Rows (M,) at which cars at depths (M,) stand on the road, where nothing of a hidden car is seen."""
-    K = frames.camera.K_left[frame_index]
-    normal, offset = (each[frame_index] for each in (frames.ground.normal, frames.ground.offset))
-    x = points_cam[..., 0].nanmedian(dim=1).values
-    y = -(normal[:, 0] * x + normal[:, 2] * depth + offset) / normal[:, 1]
-    return K[:, 1, 2] + K[:, 1, 1] * y / depth
 
 
 def _beside(frames: FrameBatch, masks: MaskCrops, frame_index: Tensor, last_row: Tensor) -> tuple[Tensor, Tensor]:

@@ -26,3 +26,22 @@ def demo() -> LoadedFrame:
 def started(masks: MaskCrops | Tensor | None = None, frames: FrameBatch | None = None) -> Detections:
     loaded = demo()
     return Detections.from_masks(frames or loaded.frame, loaded.detections.mask_left if masks is None else masks)
+
+
+def masks() -> Tensor:
+    """The left masks (6, H, W) as bool."""
+    return demo().detections.mask_left.dense() > 0.5
+
+
+def with_mirror_image(row: int) -> tuple[Tensor, FrameBatch]:
+    """The mask of a car and of six tenths of its mirror image on a wet road, and the frame."""
+    frame, mask = demo().frame, masks()[row]
+    assert frame.disparity is not None
+    disparity = frame.disparity.clone()
+    height = int(mask.any(dim=1).sum())
+    for u in mask.any(dim=0).nonzero()[:, 0].tolist():
+        bottom = int(mask[:, u].nonzero().max())
+        for below in range(1, 6 * height // 10):
+            mask[bottom + below, u] = mask[bottom - below, u]
+            disparity[0, bottom + below, u] = disparity[0, bottom - below, u]
+    return mask[None], replace(frame, disparity=disparity)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from helpers.demo_masks import demo as demo_with_boxes
+from helpers.demo_masks import with_mirror_image
 from helpers.layouts import write_odometry, write_raw, write_sequence
 
 import directshape_torch
@@ -55,6 +58,18 @@ def test_left_masks_suffice_and_others_hide(demo: LoadedFrame) -> None:
     assert not found.detections.has_mask_right.any()
     assert found.detections.occluders is not None
     assert len(found.detections.occluders.frame_index) == 2
+
+
+def test_rows_that_show_a_mirror_image_are_left_out_in_both_images() -> None:
+    mask, frame = with_mirror_image(3)
+    u0, v0, _, v1 = demo_with_boxes().detections.mask_right.boxes[3].tolist()
+    right = demo_with_boxes().detections.mask_right.crop(3).numpy() > 0.5
+    mirrored = np.pad(right, ((0, 6 * (v1 - v0) // 10), (0, 0)), mode="symmetric")
+    left = InstanceMask.found("left", 1, True, mask[0].numpy())
+    assert left is not None
+    found, _ = detections_of_masks([left, InstanceMask("right", 1, True, (u0, v0), mirrored)], frame)
+    end_left, end_right = (of.boxes[0, 3] for of in (found.detections.mask_left, found.detections.mask_right))
+    assert v1 <= end_right == end_left < left.crop_box[3]
 
 
 @pytest.mark.parametrize("layout", ["raw", "tracking", "odometry"])

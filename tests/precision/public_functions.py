@@ -309,7 +309,7 @@ CASES: dict[str, Case] = {
 WITHOUT_NUMBERS = {
     "BoxForm.order", "BoxForm.place", "Detections.has_mask_left", "Detections.has_mask_right",
     "Detections.telling_rows", "DirectShapeRefiner.detector_sigmas", "DirectShapeRefiner.weighs_detector",
-    "MaskCrops.areas", "MaskCrops.at", "MaskCrops.box_2d", "MaskCrops.crop",
+    "MaskCrops.above", "MaskCrops.areas", "MaskCrops.at", "MaskCrops.box_2d", "MaskCrops.crop",
     "MaskCrops.dense", "MaskCrops.extents", "MaskCrops.joined", "MaskCrops.none", "MaskCrops.of", "MaskCrops.of_boxes",
     "MaskCrops.padded", "MaskCrops.rows", "MaskCrops.where", "box_formats.box_form", "box_formats.check_upright",
     "image_boxes.enclosing_boxes",

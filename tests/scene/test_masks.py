@@ -50,6 +50,14 @@ def test_crops_hold_every_pixel_and_find_the_foreground(seed: int) -> None:
     torch.testing.assert_close(looked_up, expected, equal_nan=True, rtol=0, atol=0)
 
 
+def test_rows_of_crops_can_be_left_out() -> None:
+    masks = torch.rand(3, 20, 30) * (torch.arange(20) >= 5)[:, None]
+    end = torch.tensor([20, 12, 3])
+    expected = masks * (torch.arange(20) < end[:, None])[:, :, None]
+    assert MaskCrops.of(masks).above(end).dense().equal(expected)
+    assert not len(MaskCrops.of(masks).rows(end[:0]).above(end[:0]))
+
+
 def test_corners_and_whole_frames() -> None:
     masks = torch.zeros(5, 4, 6)
     masks[0, 3, 5] = masks[1, 0, 0] = masks[3] = 1.0
