@@ -74,8 +74,8 @@ class Detections(TensorRecord):
             shape (docs/tracks.md); a number below 0 is a car by itself. None means that every car is by itself.
         convention: how the boxes were written before they became poses and dimensions; messages use its words.
         is_from_masks: (B,) bool, boxes that were made of the images' own disparities (`from_masks`) and not by a
-            detector. They are no evidence of the rig or of a detector, and results are not compared with them. None
-            means that a detector made every box; when collated with frames that have values, False replaces None.
+            detector. Their depths are no evidence of the rig or of a detector, and results are not compared with them.
+            None means that a detector made every box; when collated with frames that have values, False replaces None.
         other_T_cam_obj: (B, C, 4, 4) further poses that each car may have, such as other hypotheses of a detector or
             the opposite heading; NaN where a car has fewer. The refinement tries them all, on the pixels of
             `T_cam_obj`, and goes on from the one that explains the images best (docs/no_boxes.md). None means that
