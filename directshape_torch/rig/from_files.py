@@ -82,8 +82,7 @@ def _take_in(
         return
     for frame_id in evenly(frame_ids):
         with suppress(DirectShapeError, OSError):
-            objects = dataset.objects(frame_id)
-            if dataset.has_detections and not any(found.type in dataset.classes for found in objects):
+            if not _may_have_cars(dataset, frame_id):
                 continue
             loaded = dataset.load(frame_id)
             if not len(loaded.detections):
@@ -93,6 +92,14 @@ def _take_in(
             tell(frame_id)
             if num_seen == _MOST_FRAMES or rig.in_the_middle()[1] < _SIGMA_PX:
                 break
+
+
+def _may_have_cars(dataset: StereoDataset, frame_id: str) -> bool:
+    """Whether a frame has detections of the chosen classes, or can have masks; its images are not read for this."""
+    if dataset.has_detections or dataset.masks is None:
+        return any(found.type in dataset.classes for found in dataset.objects(frame_id))
+    paths = dataset.masks.files(frame_id)
+    return not paths or any(path.is_file() for path in paths)
 
 
 def _rig_of_first(dataset: StereoDataset, frame_ids: Sequence[str], rigs: list[RigEstimate]) -> RigEstimate | None:
