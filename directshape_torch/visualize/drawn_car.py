@@ -68,8 +68,10 @@ def is_refined(status: str) -> bool:
     return status in Status.__members__ and Status[status].is_refined
 
 
-def most_telling(result: RefinementResult, cars: Tensor) -> Tensor:
-    """At most 60 cars, rows (M,), in their order: the refined ones first, then the nearest."""
+def most_telling(detections: Detections, result: RefinementResult, cars: Tensor) -> Tensor:
+    """At most 60 cars with finite boxes, rows (M,), in their order: the refined ones first, then the nearest."""
+    boxes = detections.T_cam_obj.flatten(1), detections.dimensions_hwl
+    cars = cars[torch.cat([each.detach().cpu()[cars] for each in boxes], dim=1).isfinite().all(dim=1)]
     depth, refined = (x.detach().cpu()[cars] for x in (result.T_cam_obj[:, 2, 3], result.refined))
     order = torch.argsort(depth.abs().nan_to_num(nan=_FARTHEST_M) + torch.where(refined, 0.0, _FARTHEST_M), stable=True)
     return cars[order[:_MOST_CARS].sort().values]

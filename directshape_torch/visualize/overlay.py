@@ -84,9 +84,7 @@ def overlay(frames: FrameBatch, detections: Detections, result: RefinementResult
         raise InputError("result", f"that of the {len(detections)} detections", f"{len(result)} cars")
     if not (isinstance(frame, Integral) and 0 <= frame < len(frames)):
         raise InputError("frame", f"a number of 0..{len(frames) - 1}", shown(frame))
-    drawable = detections.T_cam_obj.isfinite().flatten(1).all(dim=1) & detections.dimensions_hwl.isfinite().all(dim=1)
-    cars = ((detections.frame_index == frame) & drawable.to(detections.frame_index.device)).nonzero().flatten().cpu()
-    rows = most_telling(result, cars)
+    rows = most_telling(detections, result, (detections.frame_index == frame).nonzero().flatten().cpu())
     before, after = drawn_cars(detections.rows(rows), result.rows(rows), rows.tolist())
     view = View.of_frame(frames, number=int(frame))
     return overlay_picture(view, before, after, title=f"frame {frames.frame_ids[frame]}")
@@ -94,7 +92,8 @@ def overlay(frames: FrameBatch, detections: Detections, result: RefinementResult
 
 def overlay_of_frame(loaded: LoadedFrame, result: RefinementResult) -> Picture:
     """The picture (h, w, 3), RGB, of a refined frame."""
-    rows, detected = most_telling(result, torch.arange(len(result))), loaded.detected_objects
+    rows = most_telling(loaded.detections, result, torch.arange(len(result)))
+    detected = loaded.detected_objects
     lines = [detected[row].line_number for row in rows.tolist()]
     before, after = drawn_cars(loaded.detections.rows(rows), result.rows(rows), lines)
     truth = true_corners(loaded.labels, [one.type for one in detected], loaded.frame.camera.t_cam_ref[0])

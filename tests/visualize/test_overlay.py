@@ -169,8 +169,8 @@ def test_of_many_cars_the_refined_ones_are_drawn_and_then_the_nearest() -> None:
     many = result[rows]
     many.status_code[:] = Status.no_mask.code
     many.status_code[97] = result.status_code[1]
-    chosen = most_telling(many, torch.arange(100)).tolist()
+    chosen = most_telling(scene.detections.rows(rows), many, torch.arange(100)).tolist()
     assert len(chosen) == 60
     assert 97 in chosen
     assert set(range(0, 100, 2)) <= set(chosen)  # the nearer of the two cars
-    assert most_telling(result, torch.arange(2)).tolist() == [0, 1]
+    assert most_telling(scene.detections, result, torch.arange(2)).tolist() == [0, 1]
