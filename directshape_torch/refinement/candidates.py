@@ -26,7 +26,7 @@ from directshape_torch.state.cars import CarBatch, CarState
 from directshape_torch.status import is_refined
 from directshape_torch.terms.photometric import PhotometricEvidence
 
-SENSE_SCALE = 0.055
+SENSE_SCALE = 0.053
 """The odds of the cheaper sense of a heading are 1 plus the difference of the costs of both senses over this number.
 
 They grow slowly, because the shapes of some cars mislead strongly. scripts/calibrate_heading.py fits the number.
@@ -135,7 +135,7 @@ def probability_of_sense(
     Examples:
         >>> forward = torch.tensor([[[1.0, 0, 0], [-1.0, 0, 0]]])
         >>> probability_of_sense(torch.tensor([[2.0, 2.5]]), forward, torch.tensor([0]))
-        tensor([0.9098])
+        tensor([0.9125])
         >>> probability_of_sense(torch.tensor([[2.0, torch.inf]]), forward, torch.tensor([0]))
         tensor([nan])
     """
