@@ -93,10 +93,13 @@ class Contour(NamedTuple):
 class Sums(NamedTuple):
     """`Sums` are the fields of `terms.term.Part` of M blocks that a loop writes, and where its columns begin."""
 
+    first: int
     cost: Doubles  # (M,)
     products: Doubles  # (M, D + 1, D)
+    information: (
+        Doubles  # (M, D, D), or (M, 0, 0) where the Fisher matrix is not wanted or is the matrix of the products
+    )
     residual: Reals  # (M, R, N)
-    first: int
 
 
 class SurfaceArrays(NamedTuple):

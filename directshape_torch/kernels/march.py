@@ -35,6 +35,7 @@ def march(
     _sources: int = SOURCES,
 ) -> None:
     """Write the closest points of all rays and the hits of the rays of the first `num_left` blocks."""
+    shares = (np.arange(num_samples).astype(np.float32) + HALF) / np.float32(num_samples)
     depths, sdf = np.empty(num_samples, np.float32), np.empty(num_samples, np.float32)
     middle = (
         HALF * (search.lower[0] + search.upper[0]),
@@ -46,7 +47,7 @@ def march(
         first, centre = car * grid.nodes, centre_of(rays, block, car)
         for row in range(np.uint64(rays.ray_cam.shape[2])):
             direction = direction_of(rays, block, row, car)
-            is_inside = sample(grid, search, first, centre, direction, depths, sdf)
+            is_inside = sample(grid, search, first, centre, direction, shares, depths, sdf)
             start = least_sample(search, depths, sdf)
             crosses, depth, face = closest_from(grid, search, first, centre, direction, start, max_cells)
             closest.crosses[block, row], closest.depth[block, row] = crosses, depth
@@ -69,13 +70,19 @@ def march(
 
 @step
 def sample(
-    grid: Grid, search: Search, first: Index, centre: Point, direction: Point, depths: Reals, sdf: Reals
+    grid: Grid,
+    search: Search,
+    first: Index,
+    centre: Point,
+    direction: Point,
+    shares: Reals,
+    depths: Reals,
+    sdf: Reals,
 ) -> bool:
-    """Fill in the samples of a ray at the middles of equal parts of its interval; whether it crosses the bounds."""
+    """Fill in the samples of a ray, at shares of its interval with the bounds; whether it crosses them."""
     crosses, near, far, _, _ = interval(search, ZERO, centre, direction)
-    count = len(depths)
-    for s in range(count):
-        depths[s] = near + (far - near) * ((np.float32(s) + HALF) / np.float32(count))
+    for s in range(np.uint64(len(shares))):
+        depths[s] = near + (far - near) * shares[s]
         sdf[s] = value_at(grid, first, plus(centre, depths[s], direction))
     return crosses
 

@@ -73,8 +73,8 @@ def photometric(
                 ratio = ratio if ratio > tracking.least_share else -ONE
                 depth, depth_per_sdf = depth / ratio, depth_per_sdf / (ratio * ratio)
                 J[row, num_shape] = -depth * depth * matching.inverse_depth_per_px[car, 0]
-            node, place = cell_at(grid, position_of(grid, point))
-            write_jacobian(grid, node, place, point, gradient, depth_per_sdf, J[row])
+            node, in_cell = cell_at(grid, position_of(grid, point))
+            write_jacobian(grid, node, in_cell, point, gradient, depth_per_sdf, J[row])
             residual = out.residual[block, row]
             usable = found and compared(pixels, tracking, block, row, depth, matching.centre, residual, slopes)
             if not usable:

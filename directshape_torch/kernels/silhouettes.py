@@ -27,7 +27,7 @@ from directshape_torch.kernels.search import (
     vertex,
     write,
 )
-from directshape_torch.kernels.sums import write_jacobian, write_products, write_weighted
+from directshape_torch.kernels.sums import write_jacobian, write_products, write_square, write_weighted
 
 
 @loop
@@ -44,6 +44,7 @@ def silhouettes(
     """Write the sums of all blocks and the closest points of their rays, which begin at those of a nearby state."""
     num_rows, num_columns = rays.ray_cam.shape[2], 6 + grid.basis.shape[1]
     J, weighted = np.empty((num_rows, num_columns), np.float32), np.empty((num_rows, num_columns + 1), np.float32)
+    wants_fisher, informed = out.information.shape[1] > 0, np.empty_like(J)
     for block in range(np.uint64(len(rays.owner))):
         car, cost = np.uint64(rays.owner[block]), 0.0
         first, centre, zeta = car * grid.nodes, centre_of(rays, block, car), contour.zeta[block, 0]
@@ -56,15 +57,19 @@ def silhouettes(
             write(now.points_obj, block, row, point if crosses else last)
             write(now.face_obj, block, row, face)
             sdf, gradient = value_and_gradient_at(grid, first, point)
-            node, place = cell_at(grid, position_of(grid, point))
-            write_jacobian(grid, node, place, point, along_face(gradient, direction, face), ONE, J[row])
+            node, in_cell = cell_at(grid, position_of(grid, point))
+            write_jacobian(grid, node, in_cell, point, along_face(gradient, direction, face), ONE, J[row])
             foreground, filled = contour.foreground[block, row], contour.filled[block, row]
             residual, slope = of_distance(sdf, zeta, foreground, crosses, contour.saturation)
             out.residual[block, row, 0] = residual
             cost += filled * residual
             weight = filled / max(residual, contour.residual_floor)
             write_weighted(J[row], weight * slope * slope, filled * slope, weighted[row])
+            if wants_fisher:
+                informed[row] = filled * slope * slope * J[row]
         out.cost[block] = cost
+        if wants_fisher:
+            write_square(np.dot(informed.T, J), out.information[block], out.first)
         write_products(weighted, J, block, out)
 
 

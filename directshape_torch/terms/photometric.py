@@ -190,7 +190,7 @@ class Photometric(Term[Surface]):
         J = torch.where(usable[..., None], compare.J_residual_depth, 0.0)
         return Linear(residual, J, J_depth_state, surface.seen(anchor, depth, usable))
 
-    def native_part(self, field: Field, state: State, anchor: Surface) -> Part[Surface] | None:
+    def native_part(self, field: Field, state: State, anchor: Surface, fisher: bool) -> Part[Surface] | None:
         rows = self.pixel_set.rows
         seen = rows.along_ray, rows.intensity_left, rows.pixel_weight, rows.neighbour_weight, rows.right.pixels
         grid = native_grid(field, state.T_obj_cam, rows.rays.ray_cam, anchor.points_obj, *seen)
@@ -200,7 +200,7 @@ class Photometric(Term[Surface]):
 
         config, offset = self.config, state.offset_px
         shape = *rows.pixel_weight.shape, len(rows.intensity_left)
-        part, sums = part_to_write(self, state, map_tensors(room_like, anchor), shape)
+        part, sums = part_to_write(self, state, map_tensors(room_like, anchor), shape, False)
         of_offset = (
             self.cars.inverse_depth_of_offset(x) if x.shape[1] else x for x in (offset, torch.ones_like(offset))
         )

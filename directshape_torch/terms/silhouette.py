@@ -225,14 +225,14 @@ class Silhouettes(OfMasks[Closest]):
         residual, J_residual_sdf = self._of_distance(at.value, now.crosses)
         return Linear(residual[..., None], J_residual_sdf[..., None], sdf_state_jacobian(points, gradient, at), now)
 
-    def native_part(self, field: Field, state: State, anchor: Closest) -> Part[Closest] | None:
+    def native_part(self, field: Field, state: State, anchor: Closest, fisher: bool) -> Part[Closest] | None:
         rays, foreground, zeta = self.rows.rays, self.rows.foreground, self.zeta
         grid = native_grid(field, self.bounds_obj, state.T_obj_cam, rays.ray_cam, foreground, zeta, anchor.points_obj)
         if grid is None:
             return None
         from directshape_torch.kernels.silhouettes import silhouettes  # Numba may be missing.
 
-        part, sums = part_to_write(self, state, map_tensors(room_like, anchor), (*foreground.shape, 1))
+        part, sums = part_to_write(self, state, map_tensors(room_like, anchor), (*foreground.shape, 1), fisher)
         masks = map(array, (foreground, self.rows.filled, zeta))
         contour = Contour(*(*masks, *_CONTOUR))
         before, now = (ClosestArrays(*map(array, closest)) for closest in (anchor, part.anchor))

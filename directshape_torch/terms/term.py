@@ -150,8 +150,8 @@ class Term(Table, Protocol[AnchorT]):
         """
         ...
 
-    def native_part(self, field: Field, state: State, anchor: AnchorT) -> Part[AnchorT] | None:
-        """The part that `part_of` gives without `fisher`, by a native loop; None where none is taken."""
+    def native_part(self, field: Field, state: State, anchor: AnchorT, fisher: bool) -> Part[AnchorT] | None:
+        """What `part_of` gives, by a native loop; None where none is taken."""
         return None
 
     def residual(self, field: Field, state: State, anchor: AnchorT) -> Tensor:
@@ -178,15 +178,20 @@ class Part(NamedTuple, Generic[AnchorT]):
 
 
 def part_to_write(
-    term: Term[AnchorT], state: State, anchor: AnchorT, shape: tuple[int, int, int]
+    term: Term[AnchorT], state: State, anchor: AnchorT, shape: tuple[int, int, int], own_information: bool
 ) -> tuple[Part[AnchorT], Sums]:
-    """A part with residuals of a shape (M, R, N), and where a native loop writes it, block by block."""
+    """A part with residuals of a shape (M, R, N), and where a native loop writes it, block by block.
+
+    Without `own_information` the Gauss-Newton matrix is the Fisher matrix too.
+    """
     size = state.unknowns.size
     products = torch.zeros(shape[0], size + 1, size, dtype=torch.float64)
     cost, residual = torch.empty(shape[0], dtype=torch.float64), torch.empty(shape, dtype=state.code.dtype)
     first = state.unknowns.span(*term.sees).start
-    part = Part(cost, products, products[:, :-1], residual, anchor)
-    return part, Sums(array(cost), array(products), array(residual), first)
+    information = torch.zeros_like(products[:, :-1]) if own_information else products[:, :-1]
+    part = Part(cost, products, information, residual, anchor)
+    into = information if own_information else information[:, :0, :0]
+    return part, Sums(first, *map(array, (cost, products, into, residual)))
 
 
 def linear_of(term: Term[AnchorT], field: Field, state: State, anchor: AnchorT) -> Linear[AnchorT]:
@@ -233,7 +238,7 @@ def parts_of(
     """The parts of all terms at a state, with hand-derived Jacobians, near their anchors."""
 
     def of(term: AnyTerm, anchor: object) -> Part[Any]:
-        native = None if fisher else term.native_part(field, state, anchor)
+        native = term.native_part(field, state, anchor, fisher)
         return native or part_of(term, linear_of(term, field, state, anchor), fisher)
 
     return tuple(map(of, terms, anchors))

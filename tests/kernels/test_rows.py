@@ -27,13 +27,13 @@ class Rows(NamedTuple):
     state: State
     anchor: Any
 
-    def natively(self) -> Part[Any]:
-        part = self.term.native_part(self.field, self.state, self.anchor)
+    def natively(self, fisher: bool = True) -> Part[Any]:
+        part = self.term.native_part(self.field, self.state, self.anchor, fisher)
         assert part is not None
         return part
 
     def by_tensors(self) -> Part[Any]:
-        return part_of(self.term, linear_of(self.term, self.field, self.state, self.anchor), fisher=False)
+        return part_of(self.term, linear_of(self.term, self.field, self.state, self.anchor))
 
 
 @pytest.fixture(autouse=True)
@@ -50,8 +50,8 @@ def rows_of(bench: Bench, name: str) -> Rows:
 
 
 def sums(part: Part[Any]) -> list[Tensor]:
-    """Cost, gradient and matrix of all blocks together."""
-    return [x.sum(dim=0) for x in (part.cost, part.products[:, -1], part.products[:, :-1])]
+    """Cost, gradient and both matrices of all blocks together."""
+    return [x.sum(dim=0) for x in (part.cost, part.products[:, -1], part.products[:, :-1], part.information)]
 
 
 def relative(part: Part[Any], true: Part[Any]) -> list[float]:
@@ -151,21 +151,28 @@ def test_tensors_with_jumps_in_memory_give_the_same_bits(typical: Bench, name: s
 
 
 def test_rows_without_a_loop_take_tensor_operations_beside_those_that_have_one(typical: Bench) -> None:
-    """Priors have none, and the Fisher matrix needs tensor operations."""
     names = "silhouettes", "shape", "photometric"
     rows = [in_single(rows_of(typical, name)) for name in names]
     terms, anchors = tuple(x.term for x in rows), tuple(x.anchor for x in rows)
-    parts = parts_of(terms, rows[0].field, rows[0].state, anchors, fisher=False)
-    expected = rows[0].natively(), rows[1].by_tensors(), rows[2].natively()
-    assert rows[1].term.native_part(*rows[1][1:]) is None
-    for part, same in zip(parts, expected, strict=True):
-        assert torch.equal(part.products, same.products)
-    fisher = parts_of(terms, rows[0].field, rows[0].state, anchors)
-    assert torch.equal(fisher[0].products, rows[0].by_tensors().products)
+    assert rows[1].term.native_part(*rows[1][1:], fisher=True) is None
+    for fisher in (True, False):
+        parts = parts_of(terms, rows[0].field, rows[0].state, anchors, fisher)
+        expected = rows[0].natively(fisher), rows[1].by_tensors(), rows[2].natively(fisher)
+        for part, same in zip(parts, expected, strict=True):
+            assert torch.equal(part.products, same.products)
+            assert torch.equal(part.information, same.information)
+
+
+def test_the_fisher_matrix_is_the_matrix_of_the_products_where_nobody_asks_for_it(typical: Bench) -> None:
+    rows = in_single(rows_of(typical, "silhouettes"))
+    with_fisher, without = rows.natively(), rows.natively(fisher=False)
+    assert torch.equal(with_fisher.products, without.products)
+    assert torch.equal(without.information, without.products[:, :-1])
+    assert not torch.equal(with_fisher.information, without.information)
 
 
 def test_double_precision_and_other_settings_of_the_silhouette_take_tensor_operations(typical: Bench) -> None:
     rows = rows_of(typical, "silhouettes")
-    assert rows.term.native_part(*rows[1:]) is None
+    assert rows.term.native_part(*rows[1:], fisher=True) is None
     product = in_single(rows_of(typical, "silhouettes_product"))
-    assert product.term.native_part(*product[1:]) is None
+    assert product.term.native_part(*product[1:], fisher=True) is None
