@@ -33,8 +33,9 @@ from directshape_torch.state.cars import CarBatch
 from directshape_torch.status import Status
 from directshape_torch.stereo_matching.disparity import with_disparity
 
-# The images refute these results, and a wrong box explains it.
-_REFUTED = (Status.mask_missed, Status.no_match, Status.depth_unknown, Status.no_car, Status.rejected_worse)
+# The images refute these results, and a wrong box explains it. (It does not explain `rejected_worse`, where the images
+# like the box better than what came of it.)
+_REFUTED = (Status.mask_missed, Status.no_match, Status.depth_unknown, Status.no_car)
 # Good fits cover their masks better than this.
 _LOOSE_IOU = 0.8
 # One box in twenty is a gross error, as one mask in twenty does not show what its box says.
@@ -92,9 +93,10 @@ def _is_better(later: RefinementResult, before: RefinementResult, limits: Accept
     likely = (quality.probability_better >= limits.min_probability_better) & (
         quality.probability_not_worse >= limits.min_probability_not_worse
     )
-    # A refined car that covers its mask better from its own box stays where it is.
+    # A box that is off as usual has led to its car, so what came of it stays, unless the images refute it.
     closer = quality.mask_iou_left > before.quality.mask_iou_left
-    return likely & (~before.refined | _is_gross(before.quality.evidence) | closer)
+    elsewhere = _is_gross(quality.evidence) & (_is_gross(before.quality.evidence) | closer)
+    return likely & (~before.refined | elsewhere)
 
 
 def _is_of(result: RefinementResult, statuses: tuple[Status, ...]) -> Tensor:

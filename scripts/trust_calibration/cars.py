@@ -151,7 +151,7 @@ def refined_cars(
     config = load_config(None, overrides)
     # Results are those of the images alone, and are combined with the detections by this script.
     alone = replace(config.priors, detector_weight=0.0)
-    config = replace(config, acceptance=EVERYTHING, check="off", priors=alone)
+    config = replace(config, acceptance=EVERYTHING, check="off", search="off", priors=alone)
     refiner = DirectShapeRefiner(config=config, rig=None if by_frame else RigEstimates(estimate_rigs(dataset)))
     loaded = [dataset.load(frame_id) for frame_id in dataset.frame_ids]
     frames = []
