@@ -70,7 +70,7 @@ def _is_installed() -> bool:
         import directshape_torch.kernels.jit  # noqa: F401
     except ImportError as error:
         cure = "pip install 'directshape_torch[fast]'"
-        _logger.warning("without Numba refinements on the CPU take 1.2 times as long (%s): %s", error, cure)
+        _logger.warning("without Numba refinements on the CPU take 1.5 times as long (%s): %s", error, cure)
         return False
     return True
 

@@ -25,26 +25,25 @@ NOWHERE = (ZERO, ZERO, ZERO)
 
 
 @step
-def turned(T: Rays, car: Index, start: Point, vector: Point) -> Point:
-    """The point `start + R vector` with the rotation R of a car's pose."""
-    pose = T.T_obj_cam[car]
-    x = plus(start, vector[0], (pose[0, 0], pose[1, 0], pose[2, 0]))
-    y = plus(x, vector[1], (pose[0, 1], pose[1, 1], pose[2, 1]))
-    return plus(y, vector[2], (pose[0, 2], pose[1, 2], pose[2, 2]))
+def turned(rays: Rays, car: Index, start: Point, vector: Point) -> Point:
+    """The point `start + R vector` with the rotation R of a car."""
+    T = rays.T_obj_cam[car]
+    x = plus(start, vector[0], (T[0, 0], T[1, 0], T[2, 0]))
+    y = plus(x, vector[1], (T[0, 1], T[1, 1], T[2, 1]))
+    return plus(y, vector[2], (T[0, 2], T[1, 2], T[2, 2]))
 
 
 @step
 def centre_of(rays: Rays, block: Index, car: Index) -> Point:
     """Centre of a block's camera in the frame of its car."""
-    pose, at = rays.T_obj_cam[car], rays.centre_cam[block]
-    return turned(rays, car, (pose[0, 3], pose[1, 3], pose[2, 3]), (at[0], at[1], at[2]))
+    T, at = rays.T_obj_cam[car], rays.centre_cam[block]
+    return turned(rays, car, (T[0, 3], T[1, 3], T[2, 3]), (at[0], at[1], at[2]))
 
 
 @step
 def direction_of(rays: Rays, block: Index, row: Index, car: Index) -> Point:
     """Direction of a ray, per metre of depth, in the frame of its car."""
-    ray = rays.ray_cam
-    return turned(rays, car, NOWHERE, (ray[0, block, row], ray[1, block, row], ray[2, block, row]))
+    return turned(rays, car, NOWHERE, point_in(rays.ray_cam, block, row))
 
 
 @step

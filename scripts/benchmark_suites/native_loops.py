@@ -20,7 +20,7 @@ from directshape_torch.io.frame_collation import collate
 from directshape_torch.kernels.choice import without_kernels
 
 _SINGLE_FRAMES, _BATCH_FRAMES, _ROUNDS = 3, 8, 7
-_SCENES = "rendered", "kitti15"
+_SCENES = "rendered", "kitti", "kitti15"
 _NEAR_M = 1e-3
 
 
