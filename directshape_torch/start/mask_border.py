@@ -21,7 +21,7 @@ _SAME_PX, _MOST = 0.5, (0.1, 0.9)
 
 
 def share_going_on(
-    disparity: Tensor,  # (F, H, W) NaN where unknown
+    disparity: Tensor,  # (F, H, W) NaN or 0 where unknown
     masks: MaskCrops,  # M masks of the left images
     frame_index: Tensor,  # (M,)
 ) -> Tensor:  # (M,)
@@ -29,20 +29,22 @@ def share_going_on(
 
     A car stands before something else: the share is near 0, and a mask on a wall or on another car has a large one.
     """
-    rows = zip(range(len(masks)), frame_index.tolist(), masks.boxes.tolist(), strict=True)
-    shares = [_share(disparity[frame], masks.crop(row) > MASK_THRESHOLD, corner) for row, frame, corner in rows]
+    # The boxes of masks with gradients are whole images, so the extents say where a mask is.
+    rows = zip(frame_index.tolist(), masks, masks.extents.tolist(), strict=True)
+    shares = [_share(disparity[frame], mask > MASK_THRESHOLD, extent) for frame, mask, extent in rows]
     return torch.stack(shares) if shares else disparity.new_zeros(0)
 
 
-def _share(disparity: Tensor, mask: Tensor, box: list[int]) -> Tensor:
-    """The share of one mask (h, w), whose upper left pixel is the corner of the box."""
-    (u0, v0, u1, v1), reach = box, _AROUND_PX
+def _share(disparity: Tensor, mask: Tensor, extent: list[int]) -> Tensor:
+    """The share of one mask (H, W), whose pixels all lie in the extent."""
+    (u0, v0, u1, v1), reach = extent, _AROUND_PX
     seen: Tensor = pad(disparity, (reach,) * 4, value=torch.nan)[v0 : v1 + 2 * reach, u0 : u1 + 2 * reach]
-    covered = pad(mask, (reach,) * 4)
+    covered = pad(mask[v0:v1, u0:u1], (reach,) * 4)
     inside = seen[~_grown(~covered, _INSIDE_PX)]
     around = _grown(covered, _AROUND_PX) & ~_grown(covered, _MIXED_PX)
     around[reach + round((1 - _ON_ROAD) * (v1 - v0)) :] = False
-    within, beyond = (each[each.isfinite()] for each in (inside, seen[around]))
+    # Zero is no disparity either: the padding of frames has it.
+    within, beyond = (each[each > 0] for each in (inside, seen[around]))
     if min(len(within), len(beyond)) < _FEWEST:
         return disparity.new_tensor(torch.nan)
     low, high = torch.quantile(within, within.new_tensor(_MOST))

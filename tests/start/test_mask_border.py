@@ -34,3 +34,18 @@ def test_unknown_disparities_tell_nothing_and_the_border_of_the_image_cuts_the_s
     assert share_going_on(disparity, last, torch.tensor([0])).item() < 0.02
     assert share_going_on(unknown, last, torch.tensor([0])).isnan().all()
     assert len(share_going_on(disparity, last.rows(torch.tensor([], dtype=torch.int64)), torch.tensor([]))) == 0
+
+
+def test_masks_with_gradients_and_padded_frames_have_the_shares_of_others() -> None:
+    disparity = torch.full((1, 90, 160), 12.0)
+    # The road, whose disparities are also those of the car, begins in the middle of it.
+    disparity[0, 28:62, 93:133] = 20.0
+    disparity[0, 52:] = 20.0
+    car, frame_index = masks().rows(torch.tensor([1])), torch.tensor([0])
+    alone = share_going_on(disparity, car, frame_index)
+    assert alone.item() < 0.02
+    with_gradient = MaskCrops.of(car.dense().float().requires_grad_())
+    assert share_going_on(disparity, with_gradient, frame_index).equal(alone)
+    wall = torch.full((1, 90, 130), 12.0)
+    padded = torch.nn.functional.pad(wall, (0, 30))
+    assert share_going_on(padded, car, frame_index).item() == 1.0
