@@ -67,10 +67,10 @@ def _is_fit(tensor: Tensor) -> bool:
 @functools.cache
 def _is_installed() -> bool:
     try:
-        import directshape_torch.kernels.jit  # noqa: F401
-    except ImportError as error:
-        cure = "pip install 'directshape_torch[fast]'"
-        _logger.warning("without Numba refinements on the CPU take 1.5 times as long (%s): %s", error, cure)
+        from directshape_torch.kernels import march, photometric, silhouettes  # noqa: F401
+    except (ImportError, RuntimeError) as error:  # Numba raises the second where it may write its code nowhere.
+        cure = "pip install 'directshape_torch[fast]', or set NUMBA_CACHE_DIR to a folder that can be written"
+        _logger.warning("without native loops refinements on the CPU take 1.5 times as long (%s): %s", error, cure)
         return False
     return True
 

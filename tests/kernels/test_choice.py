@@ -10,12 +10,14 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numba
 import pytest
 import torch
 from helpers.ellipsoids import ellipsoid_prior
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from directshape_torch import kernels
 from directshape_torch.kernels import choice, jit, march, photometric, silhouettes
 from directshape_torch.kernels.choice import native_grid, without_kernels
 from directshape_torch.shape.field import PackedField
@@ -71,19 +73,35 @@ def test_whatever_is_differentiated_takes_tensor_operations(shape: GridShape, bo
 
 
 @pytest.fixture
-def missing_numba(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setitem(sys.modules, "numba", None)
-    monkeypatch.delitem(sys.modules, "directshape_torch.kernels.jit")
+def _fresh_choice(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A process that has not used a loop yet."""
+    for name in ("jit", "march", "photometric", "silhouettes"):
+        monkeypatch.delitem(sys.modules, f"directshape_torch.kernels.{name}")
+        monkeypatch.delattr(kernels, name)
     choice._is_installed.cache_clear()
     yield
     choice._is_installed.cache_clear()
 
 
-@pytest.mark.usefixtures("missing_numba")
+@pytest.mark.usefixtures("_fresh_choice")
+@pytest.mark.parametrize("is_installed", [False, True])
 @torch.no_grad()
-def test_without_numba_one_line_says_how_much_slower(
-    shape: GridShape, bounds: Tensor, caplog: pytest.LogCaptureFixture
+def test_one_line_says_how_much_slower_it_is_without_loops(
+    shape: GridShape,
+    bounds: Tensor,
+    is_installed: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
+    """Without Numba, and with one that may keep its code nowhere."""
+
+    def njit(**_options: object) -> None:
+        raise RuntimeError("cannot cache function: no locator available")
+
+    if is_installed:
+        monkeypatch.setattr(numba, "njit", njit)
+    else:
+        monkeypatch.setitem(sys.modules, "numba", None)
     with caplog.at_level(logging.WARNING):
         assert not is_taken(shape, bounds)
         assert not is_taken(shape, bounds)
