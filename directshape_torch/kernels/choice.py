@@ -103,7 +103,7 @@ def array(tensor: Tensor) -> NDArray[Any]:
 
 def room_like(tensor: Tensor) -> Tensor:
     """A tensor in one piece for a loop to write into."""
-    return torch.empty(tensor.shape, dtype=tensor.dtype)
+    return torch.empty_like(tensor, memory_format=torch.contiguous_format)
 
 
 def native_rays(rays: Rays, T_obj_cam: Tensor) -> arguments.Rays:

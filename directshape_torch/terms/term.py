@@ -185,8 +185,8 @@ def part_to_write(
     Without `own_information` the Gauss-Newton matrix is the Fisher matrix too.
     """
     size = state.unknowns.size
-    products = torch.zeros(shape[0], size + 1, size, dtype=torch.float64)
-    cost, residual = torch.empty(shape[0], dtype=torch.float64), torch.empty(shape, dtype=state.code.dtype)
+    products = state.code.new_zeros(shape[0], size + 1, size, dtype=torch.float64)
+    cost, residual = products.new_empty(shape[0]), state.code.new_empty(shape)
     first = state.unknowns.span(*term.sees).start
     information = torch.zeros_like(products[:, :-1]) if own_information else products[:, :-1]
     part = Part(cost, products, information, residual, anchor)

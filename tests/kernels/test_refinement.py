@@ -61,3 +61,11 @@ def test_two_frames_in_a_call_have_the_bits_of_one_and_again() -> None:
     assert torch.equal(alone.T_cam_obj, again.T_cam_obj)
     assert torch.equal(torch.cat([alone.T_cam_obj, alone.T_cam_obj]), twice.T_cam_obj)
     assert torch.equal(torch.cat([alone.code, alone.code]), twice.code)
+
+
+def test_a_default_device_elsewhere_changes_nothing() -> None:
+    refiner, inputs = DirectShapeRefiner(), collate(demo_scene().frames)
+    expected = refiner(*inputs)
+    with torch.device("meta"):
+        found = refiner(*inputs)
+    assert torch.equal(found.T_cam_obj, expected.T_cam_obj)
