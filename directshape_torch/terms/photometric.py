@@ -194,7 +194,7 @@ class Photometric(Term[Surface]):
         rows = self.pixel_set.rows
         seen = rows.along_ray, rows.intensity_left, rows.pixel_weight, rows.neighbour_weight, rows.right.pixels
         grid = native_grid(field, state.T_obj_cam, rows.rays.ray_cam, anchor.points_obj, *seen)
-        if grid is None:
+        if grid is None or type(self) is not Photometric:  # A subclass may have other residuals or norms.
             return None
         from directshape_torch.kernels.photometric import photometric  # Numba may be missing.
 

@@ -228,7 +228,7 @@ class Silhouettes(OfMasks[Closest]):
     def native_part(self, field: Field, state: State, anchor: Closest, fisher: bool) -> Part[Closest] | None:
         rays, foreground, zeta = self.rows.rays, self.rows.foreground, self.zeta
         grid = native_grid(field, self.bounds_obj, state.T_obj_cam, rays.ray_cam, foreground, zeta, anchor.points_obj)
-        if grid is None:
+        if grid is None or type(self) is not Silhouettes:  # A subclass may have other residuals or norms.
             return None
         from directshape_torch.kernels.silhouettes import silhouettes  # Numba may be missing.
 

@@ -176,3 +176,11 @@ def test_double_precision_and_other_settings_of_the_silhouette_take_tensor_opera
     assert rows.term.native_part(*rows[1:], fisher=True) is None
     product = in_single(rows_of(typical, "silhouettes_product"))
     assert product.term.native_part(*product[1:], fisher=True) is None
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_subclass_takes_tensor_operations(typical: Bench, name: str) -> None:
+    rows = in_single(rows_of(typical, name))
+    changed = object.__new__(type("Changed", (type(rows.term),), {}))
+    vars(changed).update(vars(rows.term))
+    assert changed.native_part(*rows[1:], fisher=True) is None
