@@ -96,18 +96,24 @@ def _ground_sources(frames: FrameBatch, detections: Detections) -> tuple[str, ..
 def going_on(result: RefinementResult, rows: Tensor, later: RefinementResult) -> RefinementResult:
     """The result with what a later minimisation says of the cars `rows` (R,), which ascend.
 
-    Terms that only the later minimisation has get a cost of 0 for the other cars.
+    Terms that only one of both has get a cost of 0 for the cars of the other.
     """
-    place = torch.tensor([later.term_names.index(name) for name in result.term_names], device=rows.device)
-    before, after = (
-        costs.new_zeros(len(result), len(later.term_names)).index_copy(1, place, costs)
-        for costs in (result.cost_before, result.cost_after)
-    )
+    names = tuple(dict.fromkeys((*later.term_names, *result.term_names)))
+    result, later = (_with_terms(each, names) for each in (result, later))
     history = later.cost_history.new_full((len(result), later.cost_history.shape[1]), torch.nan)
     history = torch.cat([result.cost_history, history.index_copy(0, rows, later.cost_history)], dim=1)
     done = result.iterations.index_add(0, rows, later.iterations)
-    result = replace(result, term_names=later.term_names, cost_before=before, cost_after=after).put(rows, later)
-    return replace(result, iterations=done, cost_history=history)
+    return replace(result.put(rows, later), iterations=done, cost_history=history)
+
+
+def _with_terms(result: RefinementResult, names: tuple[str, ...]) -> RefinementResult:
+    """The result with the costs of the named terms, which include its own."""
+    place = torch.tensor([names.index(name) for name in result.term_names], device=result.status_code.device)
+    before, after = (
+        costs.new_zeros(len(result), len(names)).index_copy(1, place, costs)
+        for costs in (result.cost_before, result.cost_after)
+    )
+    return replace(result, term_names=names, cost_before=before, cost_after=after)
 
 
 def at_states(result: RefinementResult, state: State) -> RefinementResult:

@@ -119,6 +119,20 @@ def test_views_of_tracks_and_boxes_made_of_masks_are_left_alone() -> None:
         assert Status.rescued not in refined(scene.frame, left_alone).status
 
 
+def test_a_car_by_itself_is_found_beside_views_of_a_track() -> None:
+    scene = load_scene()
+    frames = FrameBatch.joined([scene.frame, scene.frame])
+    given = cars(scene, 0, 0, 1)
+    T_cam_obj = torch.cat([given.T_cam_obj[:2], turned(given.T_cam_obj[2:])])
+    mixed = replace(given, T_cam_obj=T_cam_obj, frame_index=torch.tensor([0, 1, 0]), track_id=torch.tensor([7, 7, -1]))
+    result, alone = refined(frames, mixed), refined(frames, mixed.rows(torch.tensor([2])))
+    assert result.status[2] is alone.status[0] is Status.rescued
+    assert result.track_part.tolist() == [0, 0, -1]
+    only_of_tracks = [name not in alone.term_names for name in result.term_names]
+    assert any(only_of_tracks)
+    assert not result.cost_after[2, only_of_tracks].any()
+
+
 def test_gradients_hold_for_the_start_that_was_chosen() -> None:
     scene = load_scene()
     given = replace(cars(scene, 1), T_cam_obj=turned(cars(scene, 1).T_cam_obj).requires_grad_())
