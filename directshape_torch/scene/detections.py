@@ -65,8 +65,8 @@ class Detections(TensorRecord):
         pose_sigma: (B, 4) standard deviations of the detector's own error: along the viewing ray of the object origin
             (in the plane of the camera's x and z axes), across it in that plane, along the camera's y axis (metres),
             and of the heading (radians). Infinity means unknown. None takes the values of the settings
-            (`priors.pose_sigma_*`) or the rig, if any; when collated with frames that have values, infinity replaces
-            None.
+            (`priors.pose_sigma_*`) or the rig, if any, for boxes of a detector; when collated with frames that have
+            values, infinity replaces None.
         offset_sigma_px: (B,) standard deviation of the rig's disparity at each car about its calibration, pixels of
             full resolution; 0 where it is known. None takes the values of the rig, else of the settings
             (`rig.disparity_sigma_px`); when collated with frames that have values, 0 replaces None.

@@ -192,7 +192,8 @@ def detector_pose_sigma(config: PriorConfig, cars: CarBatch) -> Tensor:
         # This uses constant[0], because a constant of zero is infinite in `sigma`.
         distance = torch.hypot(origin[:, 0], origin[:, 2])
         sigma[:, 0] = torch.sqrt((along_share * distance) ** 2 + constant[0] ** 2)
-    return sigma
+    # The settings describe a detector, and no detector made these boxes.
+    return sigma if cars.is_from_masks is None else sigma.masked_fill(cars.is_from_masks[:, None], math.inf)
 
 
 def shape_prior(code: Tensor) -> PriorResidual:

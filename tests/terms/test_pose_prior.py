@@ -20,6 +20,8 @@ from directshape_torch.errors import InputError
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene.detections import Detections
+from directshape_torch.state.cars import CarBatch
+from directshape_torch.terms.priors import detector_pose_sigma
 
 SIGMA = torch.tensor([0.3, 0.1, 0.05, 0.06], dtype=torch.float64)
 
@@ -152,3 +154,12 @@ def test_a_car_without_a_pose_is_left_alone_beside_one_with_gradients() -> None:
     (gradient,) = torch.autograd.grad(result.T_cam_obj[0].sum(), T_cam_obj)
     assert gradient.isfinite().all()
     assert gradient[0].abs().max() > 0
+
+
+def test_standard_deviations_of_the_settings_do_not_hold_boxes_that_no_detector_made() -> None:
+    frames, detections = cached_street()[1].frames, replace(_start(), is_from_masks=torch.tensor([True, False]))
+    of_settings = _with_sigmas(along_m=0.3, across_m=0.1).priors
+    sigma = detector_pose_sigma(of_settings, CarBatch.from_scene(frames, detections))
+    assert sigma.tolist() == [[math.inf] * 4, [pytest.approx(0.3), pytest.approx(0.1), math.inf, math.inf]]
+    given = replace(detections, pose_sigma=SIGMA.expand(2, 4).to(detections.T_cam_obj))
+    assert detector_pose_sigma(of_settings, CarBatch.from_scene(frames, given)).equal(given.pose_sigma)
