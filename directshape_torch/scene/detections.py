@@ -250,17 +250,9 @@ class Detections(TensorRecord):
 
         like = frames.images_left
         size_hw = like.shape[2], like.shape[3]
-        # A list without any mask, as of an empty street, does not tell the size of the images.
-        is_nothing = isinstance(mask_left, (list, tuple)) and all(mask is None for mask in mask_left)
-        left = (
-            MaskCrops.none(len(mask_left), size_hw, like) if is_nothing else MaskCrops.of(mask_left, name="mask_left")
-        )
-        left, count = left.to(like.device), len(left)
-        right = (
-            MaskCrops.none(count, left.size_hw, left.values)
-            if mask_right is None
-            else MaskCrops.of(mask_right, name="mask_right").to(like.device)
-        )
+        left = _crops_of("mask_left", mask_left, size_hw, like)
+        count = len(left)
+        right = _crops_of("mask_right", [None] * count if mask_right is None else mask_right, size_hw, left.values)
         _check_mask_numbers(left, right, count)
         for name, masks in (("mask_left", left), ("mask_right", right)):
             if masks.size_hw != size_hw:
@@ -298,6 +290,13 @@ def _cut_masks(instances: Detections | Occluders) -> None:
     """Replace the masks of a record by crops where they came in another form."""
     for name in ("mask_left", "mask_right"):
         object.__setattr__(instances, name, MaskCrops.of(getattr(instances, name), name=name))
+
+
+def _crops_of(name: str, masks: Masks, size_hw: tuple[int, int], like: Tensor) -> MaskCrops:
+    """Crops on the device of `like`; a list without any mask, as of an empty street, tells no size of the images."""
+    if isinstance(masks, (list, tuple)) and all(mask is None for mask in masks):
+        return MaskCrops.none(len(masks), size_hw, like)
+    return MaskCrops.of(masks, name=name).to(like.device)
 
 
 def _known_poses(T: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.demo_masks import demo, started
+from helpers.demo_masks import demo, masks, started
 from torch import Tensor
 
 from directshape_torch import Detections, DirectShapeRefiner, InputError, Status
@@ -129,6 +129,10 @@ def test_masks_without_a_box_leave_the_others_alone() -> None:
 def test_a_list_without_masks_is_an_empty_street() -> None:
     assert len(Detections.from_masks(demo().frame, [])) == 0
     assert Detections.from_masks(demo().frame, [None, None]).T_cam_obj.isnan().all()
+    assert len(Detections.from_masks(demo().frame, [], [])) == 0
+    only_left = Detections.from_masks(demo().frame, masks(), [None] * 6)
+    assert only_left.T_cam_obj.equal(started().T_cam_obj)
+    assert not only_left.has_mask_right.any()
 
 
 def test_no_masks_give_no_boxes() -> None:
