@@ -54,6 +54,7 @@ def _refinement(frame: FrameResult, line: KittiObject) -> dict[str, Any]:
         "sigma_xyz_yaw": shapes.sigmas_ref[car],
         "probability_better": shapes.probabilities_better[car],
         "probability_not_worse": shapes.probabilities_not_worse[car],
+        "probability_heading": shapes.probabilities_heading[car],
         "mask_iou_left": shapes.mask_iou_left[car],
         "mask_iou_right": shapes.mask_iou_right[car],
         "code": shapes.codes[car],

@@ -41,6 +41,8 @@ def test_kitti_json_says_what_the_lines_and_the_npz_say(finished: FinishedRun, e
     np.testing.assert_allclose(first["code"], state["codes"][0])
     for name in ("better", "not_worse"):
         np.testing.assert_allclose(first[f"probability_{name}"], state[f"probabilities_{name}"][0])
+    assert first["probability_heading"] is None
+    assert np.isnan(state["probabilities_heading"][0])
     np.testing.assert_allclose(first["location"], state["boxes_location_ref"][0], atol=1e-4)
 
 
