@@ -263,6 +263,7 @@ class DirectShapeRefiner(nn.Module):
         started = replace(started, track_id=detections.track_id, other_T_cam_obj=None)
         started, of_front = facing_one_way(frames, started, has_others, of_front)
         result, started = self._refine(frames, started, term_weights=term_weights, detector_noise=detector_noise)
+        of_front = torch.where(result.refined, of_front, torch.nan)
         return replace(result, quality=replace(result.quality, probability_heading=of_front)), started
 
     @full_precision()

@@ -40,7 +40,8 @@ class FitQuality(CarRecord):
             overlap minus 0.05. For cars with status `not_trusted` or `no_car` all figures belong to the refinement that
             was not returned.
         probability_heading: (B,) calibrated probability that the front of the car is where the result has it, and not
-            at the opposite end. It is 0.5 where the images cannot tell, and NaN where only one sense was tried.
+            at the opposite end. It is 0.5 where the images cannot tell, below it where the likelier
+            sense was refused, and NaN where only one sense was tried.
     """
 
     mask_iou_left: Annotated[Tensor, Dense("B")]

@@ -18,6 +18,7 @@ from torch import Tensor
 from directshape_torch.config import AcceptanceConfig, RefinerConfig
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.projection import project
+from directshape_torch.numerics.gradient_mode import is_plain
 from directshape_torch.numerics.tables import Chosen
 from directshape_torch.refinement.fusion import chances, compared, fused
 from directshape_torch.refinement.make_result import going_on
@@ -67,7 +68,8 @@ def searched(
         result: what came of the given boxes.
         refine: refines some cars (B,) of other detections.
     """
-    if config.search == "off" or not is_judged(result.term_names):
+    # Under a transform of `torch.func` the disparity of the images cannot be matched.
+    if config.search == "off" or not is_judged(result.term_names) or not is_plain(frames.images_left):
         return result
     lost = _has_own_mask(frames, detections) & (result.refined | _is_of(result, (*_REFUTED, Status.not_trusted)))
     if config.search == "rescue":

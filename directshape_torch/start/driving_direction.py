@@ -48,6 +48,8 @@ def facing_one_way(
     for rows in _tracks(frames, detections, in_track):
         of_track = _sense_of_track(T[rows])
         log_odds = (of_track.to(says) * says[rows]).mean()
+        if not has_poses and bool(probability[rows].isnan().all()):
+            log_odds = log_odds + torch.nan
         if has_poses:
             log_odds = log_odds + _log_odds_of_way(T[rows], T_cam_obj[rows], of_track).to(says)
         sense[rows] = torch.where(log_odds < 0, -of_track, of_track)
