@@ -13,8 +13,8 @@ from directshape_torch.scene.frames import FrameBatch
 
 # Start boxes are off by this share of their distance along the viewing ray, and by this length in any direction.
 _SIGMA_SHARE, _SIGMA_M = 0.03, 0.2
-# One car of so many drives backwards.
-_BACKWARDS_SHARE = 0.01
+# This share of all cars drives backwards, and this share of a detector's boxes faces the wrong way.
+_BACKWARDS_SHARE, _WRONG_SHARE = 0.01, 0.05
 
 
 def facing_one_way(
@@ -27,7 +27,7 @@ def facing_one_way(
 
     A car turns by less than a right angle from one view to the next, so the sense of one view gives that of all. The
     mean of what the views say decides, for views of one car are misled alike, together with the way that the car has
-    driven along its headings where poses of the camera are known.
+    driven along its headings where poses of the camera are known. Views with a given front have a say, too.
 
     Args:
         frames: the frames of the call.
@@ -40,20 +40,25 @@ def facing_one_way(
     """
     assert detections.track_id is not None, "the cars have no tracks"
     T_cam_obj = detections.T_cam_obj.detach()
-    in_track = is_questioned & (detections.track_id >= 0) & T_cam_obj.isfinite().flatten(1).all(dim=1)
+    in_track = (detections.track_id >= 0) & T_cam_obj.isfinite().flatten(1).all(dim=1)
     has_poses, eye = frames.T_world_cam is not None, torch.eye(4).to(T_cam_obj)[None]
     T_frame_cam = eye.expand(len(frames), 4, 4) if frames.T_world_cam is None else frames.T_world_cam
-    T, says = T_frame_cam[detections.frame_index] @ T_cam_obj, torch.logit(probability).nan_to_num(nan=0.0)
+    T = T_frame_cam[detections.frame_index] @ T_cam_obj
+    says = torch.logit(torch.where(is_questioned, probability, 1 - _WRONG_SHARE)).nan_to_num(nan=0.0)
     sense, probability = torch.ones_like(T_cam_obj[:, 0, 0]), probability.clone()
     for rows in _tracks(frames, detections, in_track):
+        if not bool(is_questioned[rows].any()):
+            continue
         of_track = _sense_of_track(T[rows])
         log_odds = (of_track.to(says) * says[rows]).mean()
-        if not has_poses and bool(probability[rows].isnan().all()):
+        if not has_poses and bool((probability[rows].isnan() & is_questioned[rows]).all()):
             log_odds = log_odds + torch.nan
         if has_poses:
             log_odds = log_odds + _log_odds_of_way(T[rows], T_cam_obj[rows], of_track).to(says)
         sense[rows] = torch.where(log_odds < 0, -of_track, of_track)
         probability[rows] = torch.sigmoid(log_odds.abs())
+    # The front of a given box stays where it is.
+    sense, probability = sense.masked_fill(~is_questioned, 1.0), probability.masked_fill(~is_questioned, torch.nan)
     turn = torch.stack([sense, torch.ones_like(sense), sense, torch.ones_like(sense)], dim=1)
     return replace(detections, T_cam_obj=detections.T_cam_obj * turn[:, None]), probability
 

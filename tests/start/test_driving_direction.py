@@ -84,4 +84,15 @@ def test_given_fronts_and_cars_by_themselves_stay() -> None:
     for given, is_questioned in ((detections, ~questioned), (alone, questioned)):
         found, probability = facing_one_way(frames, given, is_questioned, says)
         assert torch.equal(found.T_cam_obj, detections.T_cam_obj)
-        assert torch.equal(probability, says)
+        torch.testing.assert_close(probability, says.where(is_questioned, torch.nan), equal_nan=True)
+
+
+def test_a_view_with_a_given_front_has_a_say() -> None:
+    truth = torch.full((3,), 0.3)
+    frames, detections = scene(truth, 0.0, has_poses=False)
+    is_questioned = torch.tensor([True, False, True])
+    start = turned(detections, [True, False, True])
+    found, probability = facing_one_way(frames, start, is_questioned, torch.tensor([0.6, math.nan, 0.6]))
+    torch.testing.assert_close(headings_of(found), truth)
+    assert (probability[is_questioned] > 0.6).all()
+    assert probability[1].isnan()
