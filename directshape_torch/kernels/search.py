@@ -85,7 +85,8 @@ def interval(search: Search, margin: Real, centre: Point, direction: Point) -> t
     enters_z, leaves_z = slab(a[2] + margin, b[2] - margin, centre[2], direction[2], least)
     near, far = max(enters_x, enters_y, enters_z, ZERO), min(leaves_x, leaves_y, leaves_z)
     enters, leaves = (enters_x, enters_y, enters_z), (leaves_x, leaves_y, leaves_z)
-    if far > near:
+    # `max` and `min` may pass over a NaN, which comes of a pose that is not finite.
+    if far > near and not (np.isnan(enters_x) or np.isnan(enters_y) or np.isnan(enters_z)):
         return True, near, far, enters, leaves
     return False, ONE, TWO, enters, leaves
 

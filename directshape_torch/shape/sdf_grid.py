@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding
 
+from directshape_torch.errors import InputError
 from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.numerics.records import Dense
@@ -61,7 +62,13 @@ class GridShape(NamedTuple):
 
     @classmethod
     def of(cls, values: Tensor, basis: Tensor, origin: Tensor, spacing_m: float) -> Self:
-        """The fields of B grids (B, nx, ny, nz) with a basis (nx, ny, nz, K) and node (0, 0, 0) at `origin` (3,)."""
+        """The fields of B grids (B, nx, ny, nz) with a basis (nx, ny, nz, K) and node (0, 0, 0) at `origin` (3,).
+
+        Raises:
+            InputError: fewer than two nodes along an axis, between which nothing can be interpolated.
+        """
+        if min(basis.shape[:3]) < 2:
+            raise InputError("basis", "at least two nodes along each axis", f"{tuple(basis.shape[:3])}")
         return cls(values, basis, origin, constant_like(tuple(n - 1.0 for n in basis.shape[:3]), origin), spacing_m)
 
     @in_full_precision

@@ -132,15 +132,15 @@ def test_a_car_alone_has_the_bits_that_it_has_beside_others_and_again(typical: B
         assert same_bits(alone, of_car)
 
 
-@pytest.mark.parametrize("what", ["pose", "values", "ray"])
+@pytest.mark.parametrize("what", ["pose x", "pose y", "pose z", "values", "ray"])
 @pytest.mark.parametrize("number", [float("nan"), float("inf")])
 def test_numbers_gone_wrong_stay_with_their_car(what: str, number: float) -> None:
     call = toy_call((9, 4, 6))
     expected = natively(call)
     left, right, bounds, count, shape, poses = call
-    if what == "pose":
+    if what.startswith("pose"):
         poses = poses.clone()
-        poses[0, 0, 3] = number
+        poses[0, "xyz".index(what[-1]), 3] = number
     elif what == "values":
         shape = shape._replace(values=shape.values.index_fill(0, torch.tensor([0]), number))
     else:
@@ -154,6 +154,8 @@ def test_numbers_gone_wrong_stay_with_their_car(what: str, number: float) -> Non
         (Closest(*(x[..., others, :] for x in expected[0])), Hits(*(x[..., [1], :] for x in expected[1]))),
     )
     assert not hits.found[0].any()
+    if what.startswith("pose"):
+        assert not closest.crosses[0].any()
 
 
 def test_tensors_with_jumps_in_memory_give_the_same_bits(typical: Bench) -> None:

@@ -247,3 +247,9 @@ def test_extents_of_nothing_and_wrong_shapes():
     assert zero_level_extents(torch.zeros(0, 4, 4, 4), torch.zeros(3), 0.1).shape == (0, 2, 3)
     with pytest.raises(InputError, match="values: expected shape"):
         zero_level_extents(torch.zeros(4, 4, 4), torch.zeros(3), 0.1)
+
+
+@pytest.mark.parametrize("counts", [(1, 3, 3), (3, 1, 3), (3, 3, 1)])
+def test_grids_of_one_layer_are_refused(counts: tuple[int, int, int]) -> None:
+    with pytest.raises(InputError, match="basis: expected at least two nodes along each axis"):
+        GridShape.of(torch.zeros(1, *counts), torch.zeros(*counts, 2), torch.zeros(3), SPACING)
