@@ -47,7 +47,8 @@ def _share(disparity: Tensor, mask: Tensor, extent: list[int]) -> Tensor:
     within, beyond = (each[each > 0] for each in (inside, seen[around]))
     if min(len(within), len(beyond)) < _FEWEST:
         return disparity.new_tensor(torch.nan)
-    low, high = torch.quantile(within, within.new_tensor(_MOST))
+    ordered = within.sort().values
+    low, high = (ordered[round(share * (len(ordered) - 1))] for share in _MOST)
     goes_on: Tensor = (beyond > low - _SAME_PX) & (beyond < high + _SAME_PX)
     return goes_on.to(disparity.dtype).mean()
 

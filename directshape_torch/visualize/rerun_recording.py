@@ -47,10 +47,10 @@ class RerunExporter(Exporter):
     """
 
     def __init__(self, *args: Any) -> None:
-        _import_rerun()
         super().__init__(*args)
         if self.inputs.dataset is None:
             raise InputError("--data", "the data set of the run, for the pictures of a recording", "nothing")
+        _import_rerun()
         self.numbers, self.iteration = frame_numbers(self.inputs.run.frame_ids), 0
         self._stream: _Stream | None = None
 

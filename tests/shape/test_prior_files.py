@@ -18,6 +18,7 @@ from directshape_torch.io.result_files import read_shapes
 from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.neural_prior import NeuralShapePrior
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.status import Status
 
 
 def write(kind: str, folder: Path) -> Path:
@@ -110,5 +111,5 @@ def test_the_refine_command_takes_another_kind_than_pca(tmp_path: Path) -> None:
     assert main([str(word) for word in (*words, *options, *settings)]) == 0
     shapes = read_shapes(out / "shapes" / "000000.npz")
     assert shapes.codes.shape == (2, prior_of("neural").num_codes)
-    refined = [status in ("converged", "max_iterations") for status in shapes.statuses]
+    refined = [Status[status].is_refined for status in shapes.statuses]
     assert len(list((out / "meshes").glob("*.ply"))) == sum(refined)

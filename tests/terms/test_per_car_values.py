@@ -28,7 +28,8 @@ from directshape_torch.terms.priors import PriorResidual, PriorTerm
 
 COPIES = 3
 # Boxes of one car would hide each other.
-CONFIG = replace(DEFAULT, sampling=replace(DEFAULT.sampling, occlusion=False))
+# A search would ask the factory again, for the cars that it searches for.
+CONFIG = replace(DEFAULT, sampling=replace(DEFAULT.sampling, occlusion=False), search="off")
 WEIGHT = 2e5
 """Pulls a car to its radar's position whatever the images say."""
 
