@@ -98,8 +98,8 @@ class _Try(NamedTuple):
         The cost is infinite where there is none.
         """
         minimum, names = self.refined.minimum, self.refined.problem.term_names
-        compares = [number for number, name in enumerate(names) if name not in PhotometricEvidence.names]
-        cost = minimum.after.term_costs[:, compares].sum(dim=1)
+        left_out = torch.tensor([name in PhotometricEvidence.names for name in names], device=self.chosen.keep.device)
+        cost = minimum.after.term_costs.masked_fill(left_out, 0.0).sum(dim=1)
         cost = cost.masked_fill(cost.isnan(), torch.inf)
         of_all = cost.new_full(self.chosen.keep.shape, torch.inf).index_copy(0, self.chosen.index, cost)
         # The first row of R_obj_cam is the object's x axis in the camera's frame.

@@ -64,8 +64,10 @@ def height_above_ground(points_cam: Tensor, frames: FrameBatch, frame_index: Ten
 
 def nearest_depth(points_cam: Tensor) -> Tensor:
     """The depth (M,) of the nearest of the points (M, P, 3) but for a few that may be wrong, metres."""
-    # An empty tensor has no quantiles.
-    return points_cam[..., 2].nanquantile(_NEAREST_SHARE, dim=1) if len(points_cam) else points_cam[:, 0, 2]
+    ordered = points_cam[..., 2].sort(dim=1).values  # NaN comes last
+    place = _NEAREST_SHARE * (ordered.isfinite().sum(dim=1, keepdim=True) - 1).clamp_min(0)
+    below, above = (ordered.gather(1, each.long())[:, 0] for each in (place.floor(), place.ceil()))
+    return torch.lerp(below, above, (place - place.floor())[:, 0].to(ordered))
 
 
 def rows_of_height(frames: FrameBatch, frame_index: Tensor, points_cam: Tensor, height_m: float) -> Tensor:
