@@ -7,7 +7,8 @@ All boxes are changed alike, and their 2D boxes and masks stay. The refiner has 
 as most detectors are, which a run whose boxes are all wrong would not. Printed are, for each way to be wrong and each
 value of `search`, the mean BEV IoU before and after, the share of cars whose BEV IoU fell by more than 0.05, and the
 share of axes that are off by more than 60 degrees at the end, of all counted labels with a mask, and how many cars were
-found from their mask.
+found from their mask. A second table says how many masks stand out from their surroundings, as a search demands, on
+their own image and on the next one of the same size.
 """
 
 from __future__ import annotations
@@ -28,9 +29,12 @@ from directshape_torch.geometry.box3d import rotation_about_y
 from directshape_torch.geometry.box_formats import poses_to_boxes
 from directshape_torch.io.config_files import load_config
 from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
+from directshape_torch.refinement.rescue import LARGEST_SHARE_GOING_ON
 from directshape_torch.refinement.trust import WORSE_BY
 from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.start.mask_border import share_going_on
 from directshape_torch.status import Status
+from directshape_torch.stereo_matching.disparity import with_disparity
 
 
 def turned(degrees: float) -> Callable[[Tensor], Tensor]:
@@ -68,13 +72,12 @@ def run(args: argparse.Namespace) -> None:
     """Refine and print the table."""
     dataset = open_dataset("kitti", args.data, args.detections, args.masks)
     config = load_config(None, ["compile=off", "check=off"])
-    refiner = DirectShapeRefiner(config=config)
     loaded = [dataset.load(frame_id) for frame_id in dataset.frame_ids]
     print("| boxes | search | cars | BEV IoU, mean (worse) | axis off by more than 60 degrees | found from the mask |")
     print("|---|---|---|---|---|---|")
     for name, change in WRONG.items():
         for search in args.search:
-            refiner.config = replace(config, search=search)
+            refiner = DirectShapeRefiner(config=replace(config, search=search))
             parts = [refined(refiner, frame, change) for frame in loaded if len(frame.detections)]
             before, after, off_deg, found = torch.cat(parts).unbind(dim=1)
             means, worse = f"{before.mean():.3f} -> {after.mean():.3f}", (after < before - WORSE_BY).double().mean()
@@ -83,6 +86,24 @@ def run(args: argparse.Namespace) -> None:
                 f"| {name} | {search} | {len(before)} | {means} ({worse:.1%}) | {ends} |",
                 flush=True,
             )
+
+    print(f"\n{masks_that_stand_out(loaded)}")
+
+
+def masks_that_stand_out(loaded: Sequence[LoadedFrame]) -> str:
+    """A table of the masks that stand out on their own images, and laid on the next image of the same size."""
+    frames = [with_disparity(each.frame) for each in loaded]
+    lines = ["| masks of at least 400 pixels on | stand out | least share that goes on |", "|---|---|---|"]
+    for name, offset in (("their own image", 0), ("the next image", 1)):
+        shares = []
+        for number, each in enumerate(loaded):
+            masks, disparity = each.detections.mask_left, frames[(number + offset) % len(frames)].disparity
+            if disparity is not None and tuple(disparity.shape[1:]) == masks.size_hw:
+                share = share_going_on(disparity, masks, each.detections.frame_index)
+                shares.append(share[(masks.areas >= 400) & share.isfinite()])
+        share = torch.cat(shares)
+        lines.append(f"| {name} | {int((share < LARGEST_SHARE_GOING_ON).sum())} of {len(share)} | {share.min():.2f} |")
+    return "\n".join(lines)
 
 
 @torch.no_grad()

@@ -41,9 +41,9 @@ _REFUTED = (Status.mask_missed, Status.no_match, Status.depth_unknown, Status.no
 _LOOSE_IOU = 0.8
 # One box in twenty is a gross error, as one mask in twenty does not show what its box says.
 _GROSS = 0.05
-# Of masks that show their car 65 in 69 have a smaller share of surroundings that go on where they end, and of masks on
-# other images none in 48 (kitti15, `noisy_mono`). So the odds that there is a car rise by about this factor.
-_LARGEST_SHARE_GOING_ON, _ODDS_OF_STANDING_OUT = 0.15, 20.0
+# Most masks that show their car have a smaller share of surroundings that go on where they end, and next to no masks on
+# other images do (scripts/wrong_boxes.py counts them). So the odds that there is a car rise by about this factor.
+LARGEST_SHARE_GOING_ON, _ODDS_OF_STANDING_OUT = 0.15, 20.0
 # The mask belongs to the box if it overlaps the 2D box by this IoU.
 _LEAST_IOU_2D = 0.5
 
@@ -137,7 +137,7 @@ def _stands_out(frames: FrameBatch, detections: Detections, chosen: Tensor) -> T
     rows = chosen.nonzero()[:, 0]
     some = detections.rows(rows)
     share = share_going_on(frames.disparity, some.mask_left, some.frame_index)
-    return torch.zeros_like(chosen).index_copy(0, rows, share < _LARGEST_SHARE_GOING_ON)  # NaN is not below
+    return torch.zeros_like(chosen).index_copy(0, rows, share < LARGEST_SHARE_GOING_ON)  # NaN is not below
 
 
 def _iou(boxes: Tensor, others: Tensor) -> Tensor:

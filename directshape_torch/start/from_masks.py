@@ -36,8 +36,8 @@ _HEIGHT_M, _WIDTH_M, _DEPTH_M = (0.4, 2.4), (0.5, 6.5), (2.0, 80.0)
 _CAR_HEIGHT_M, _ROAD_M = 2.0, 0.2
 # Median height of a car's points above the road, which may be known badly, and median deviation from it.
 _MIDDLE_M, _SPREAD_M = (-0.5, 2.0), (0.08, 1.0)
-# Of the points under the mask of one car at most this share lies beside its rectangle, by this distance and their
-# noise, and its columns go on beyond those of its rectangle by at most this.
+# At most this share of the points under the mask of one car lies farther than this distance and their noise beside its
+# rectangle, and the columns of the mask go on beyond those of the rectangle by at most the last number.
 _BESIDE_SHARE, _BESIDE_M, _BEYOND_M = 0.3, 0.5, 0.4
 # The fit of a car has at most this robust cost, square metres.
 _LARGEST_COST = 0.12
@@ -135,7 +135,7 @@ def _placed(
 
 
 def _another(places: Tensor) -> Tensor:
-    """Of rectangles (M, C, 5), from the lowest cost on, the first (M, 5) that differs from the best, or NaN."""
+    """Return the first rectangle (M, 5) of some (M, C, 5), the best ones first, that differs from the best, or NaN."""
     off = places - places[:, :1]
     turned = torch.remainder(off[..., 2] + 0.5 * math.pi, math.pi) - 0.5 * math.pi
     differs = (turned.abs() > _OTHER_TURN_RAD) | (off[..., :2].norm(dim=-1) > _OTHER_PLACE_M)

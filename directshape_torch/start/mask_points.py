@@ -11,7 +11,7 @@ from directshape_torch.geometry.stereo_depth import points_from_disparity
 from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.scene.masks import MASK_THRESHOLD, MaskCrops
 
-# At most 1600 pixels of a mask are examined, and at most 100 of those with a disparity become points.
+# At most 1600 pixels of a mask are examined, and at most 200 of those with a disparity become points.
 _MOST_PIXELS, _MOST_POINTS = 1600, 200
 # Disparities below this are of objects beyond every car, or wrong.
 _LEAST_DISPARITY_PX = 2.0

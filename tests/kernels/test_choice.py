@@ -93,7 +93,7 @@ def test_one_line_says_how_much_slower_it_is_without_loops(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """Without Numba, and with one that may keep its code nowhere."""
+    """The cases are a package without Numba, and a Numba that may keep its code nowhere."""
 
     def njit(**_options: object) -> None:
         raise RuntimeError("cannot cache function: no locator available")

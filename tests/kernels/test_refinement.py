@@ -38,7 +38,7 @@ def check_agreement(native: RefinementResult, by_tensors: RefinementResult) -> N
 
 @pytest.mark.parametrize("changes", [[], ["rig.disparity_sigma_px=0"], ["solver.rays=marched"]])
 def test_the_bundled_frame_ends_where_tensor_operations_take_it(changes: list[str]) -> None:
-    """With and without an unknown offset of the rig, and where the rays of each state are marched."""
+    """Settings have an unknown offset of the rig or none, or march the rays of each state."""
     refiner, inputs = DirectShapeRefiner(config=load_config(None, changes)), collate(demo_scene().frames)
     native = refiner(*inputs)
     with without_kernels():

@@ -109,7 +109,7 @@ def test_a_car_alone_has_the_bits_that_it_has_beside_others_and_again(typical: B
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("what", ["pose", "values", "anchor"])
 def test_numbers_gone_wrong_stay_with_their_car(typical: Bench, name: str, what: str) -> None:
-    """And they are seen in its cost or gradient, unless its rays are only lost."""
+    """Such numbers show in the cost or gradient of their own car, unless its rays are only lost."""
     rows = in_single(rows_of(typical, name))
     expected = rows.natively()
     wrong = torch.tensor([0])

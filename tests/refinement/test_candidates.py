@@ -1,4 +1,4 @@
-"""Of several poses of a car the result of the best one is kept, whoever else is refined and in whatever order."""
+"""The result of the best of several poses of a car is kept, whoever else is refined and in whatever order."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def test_who_costs_as_much_in_both_senses_has_an_even_chance() -> None:
 
 
 def test_views_of_a_track_agree_on_the_front(demo: LoadedFrame, cars: Detections) -> None:
-    """The same frame is there twice; in the second view the start faces the other way."""
+    """The second view is the same frame again, and its start faces the other way."""
     frames, twice = collate([replace(demo, detections=cars), replace(demo, detections=cars)])
     count = len(cars)
     start = twice.T_cam_obj.clone()
