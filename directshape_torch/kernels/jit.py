@@ -13,7 +13,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numba
 
@@ -27,6 +27,12 @@ def loop(function: _FunctionT) -> _FunctionT:
     """Compile a function that Python calls, and keep its code on the disk; other threads run while it works."""
     # A division by zero gives infinity or NaN, as it does in tensors.
     return cast(_FunctionT, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+
+
+def is_compiled(function: Callable[..., object]) -> bool:
+    """Whether the code of a loop, perhaps of older sources, is kept on the disk."""
+    name, folder = function.__name__, Path(cast(Any, function).stats.cache_path)
+    return any(folder.glob(f"*.{name}-*.nbi"))
 
 
 def step(function: _FunctionT) -> _FunctionT:
