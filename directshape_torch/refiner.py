@@ -309,7 +309,7 @@ class DirectShapeRefiner(nn.Module):
         from directshape_torch.stereo_matching.disparity import with_disparity
         from directshape_torch.terms.car_points import car_points
 
-        matched = with_disparity(frames, needed=detections.frame_index)
+        matched = with_disparity(frames, detections.frame_index)
         return replace(seen, points=car_points(matched, detections, self.config.point_cloud))
 
     def _minimise(

@@ -9,6 +9,7 @@ is in docs/derivations/fusion.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -45,6 +46,8 @@ _GROSS = 0.05
 # they end, and on the next image 12 % of them do (scripts/wrong_boxes.py). So the odds that there is a car rise by
 # about this factor.
 LARGEST_SHARE_GOING_ON, _ODDS_OF_STANDING_OUT = 0.15, 8.0
+# A refinement moves a box by about this much.
+_REACH_M, _REACH_RAD = 1.0, math.radians(20)
 # The mask belongs to the box if it overlaps the 2D box by this IoU.
 _LEAST_IOU_2D = 0.5
 
@@ -77,11 +80,14 @@ def searched(
         lost = lost & _is_doubted(result)
     if not bool(lost.any()):
         return result
-    frames = with_disparity(frames, needed=detections.frame_index[lost])
+    frames = with_disparity(frames, detections.frame_index[lost], detections.mask_left.extents[lost])
     lost = lost & _stands_out(frames, detections, lost)
     if not bool(lost.any()):
         return result
-    again, _ = refine(_made_of_masks(frames, detections, result, lost), lost)
+    made, lost = _made_of_masks(frames, detections, result, lost)
+    if not bool(lost.any()):
+        return result
+    again, _ = refine(made, lost)
     found = Chosen.where(lost & again.refined)
     given = replace(CarBatch.from_scene(frames, detections), detector_noise=detector_noise).of(found)
     before = result.rows(found.index)
@@ -153,16 +159,21 @@ def _areas(boxes: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _made_of_masks(frames: FrameBatch, detections: Detections, result: RefinementResult, lost: Tensor) -> Detections:
-    """The detections with boxes made of their masks for the cars (B,) that may be lost.
+def _made_of_masks(
+    frames: FrameBatch, detections: Detections, result: RefinementResult, lost: Tensor
+) -> tuple[Detections, Tensor]:
+    """The detections with boxes made of their masks for those cars (B,) that may be lost, and which cars these are.
 
-    The other cars, which may hide these, stand where the result has them.
+    The other cars, which may hide these, stand where the result has them. A car is not lost if no box of its mask is
+    out of the reach of its given box.
     """
-    some = detections.rows(lost.nonzero()[:, 0])
+    rows = lost.nonzero()[:, 0]
+    some = detections.rows(rows)
     made = start_boxes(frames, some.mask_left, some.mask_right, some.frame_index, some.score)
     # Each of the other cars gets the row of some lost car, and its own values below.
     everyone = made.rows((lost.cumsum(0) - 1).clamp_min(0))
-    return replace(
+    lost = lost.index_copy(0, rows, _is_out_of_reach(made, some.T_cam_obj))
+    everyone = replace(
         everyone,
         frame_index=detections.frame_index,
         T_cam_obj=torch.where(lost[:, None, None], everyone.T_cam_obj, result.T_cam_obj.detach()),
@@ -176,6 +187,17 @@ def _made_of_masks(frames: FrameBatch, detections: Detections, result: Refinemen
         pose_sigma=torch.full_like(detections.box_2d, torch.inf) if "pose" in result.term_names else None,
         offset_sigma_px=detections.offset_sigma_px,
     )
+    return everyone, lost
+
+
+def _is_out_of_reach(made: Detections, T_cam_obj: Tensor) -> Tensor:
+    """Whether (B,) some pose of cars is farther from the given ones (B, 4, 4) than a refinement goes."""
+    assert made.other_T_cam_obj is not None
+    poses = torch.cat([made.T_cam_obj[:, None], made.other_T_cam_obj], dim=1)
+    moved_m = (poses[..., 0:3:2, 3] - T_cam_obj[:, None, 0:3:2, 3]).norm(dim=-1)
+    cos_turned = (poses[..., :3, 0] * T_cam_obj[:, None, :3, 0]).sum(dim=-1).abs()
+    # NaN, for a mask without a car, is not farther.
+    return ((moved_m > _REACH_M) | (cos_turned < math.cos(_REACH_RAD))).any(dim=1)
 
 
 @torch.no_grad()

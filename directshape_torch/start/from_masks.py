@@ -58,7 +58,7 @@ def start_boxes(
 ) -> Detections:
     """The detections of `Detections.from_masks`."""
     _check_frame_index(frame_index, len(frames))
-    frames = with_disparity(frames, needed=frame_index)
+    frames = with_disparity(frames, frame_index, mask_left.extents)
     under = points_under(frames, mask_left, frame_index)
     end = _mirrored_rows(frames, mask_left, frame_index, under.points_cam)
     if bool((end < mask_left.size_hw[0]).any()):

@@ -40,8 +40,8 @@ def test_only_frames_that_are_needed_are_matched() -> None:
     frame = cached_street()[1].frames
     frames = joined_frames([frame, frame])
     every = with_disparity(frames).disparity
-    one = with_disparity(frames, needed=torch.tensor([1, 1])).disparity
-    none = with_disparity(frames, needed=torch.zeros(0, dtype=torch.long)).disparity
+    one = with_disparity(frames, torch.tensor([1, 1])).disparity
+    none = with_disparity(frames, torch.zeros(0, dtype=torch.long)).disparity
     assert every is not None
     assert one is not None
     assert none is not None
