@@ -99,7 +99,8 @@ def point(numbers: Tensor) -> arguments.Point:
 
 def array(tensor: Tensor) -> NDArray[Any]:
     """The numbers of a tensor, in one piece; a loop writes into a tensor that is in one piece already."""
-    array: NDArray[Any] = tensor.detach().contiguous().numpy()
+    plain = tensor.detach() if tensor.requires_grad else tensor
+    array: NDArray[Any] = plain.contiguous().numpy()
     return array
 
 

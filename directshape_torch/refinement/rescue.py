@@ -31,6 +31,7 @@ from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.start.from_masks import start_boxes
 from directshape_torch.start.mask_border import share_going_on
+from directshape_torch.start.mask_points import depth_noise
 from directshape_torch.state.cars import CarBatch
 from directshape_torch.status import Status
 from directshape_torch.stereo_matching.disparity import with_disparity
@@ -172,7 +173,7 @@ def _made_of_masks(
     made = start_boxes(frames, some.mask_left, some.mask_right, some.frame_index, some.score)
     # Each of the other cars gets the row of some lost car, and its own values below.
     everyone = made.rows((lost.cumsum(0) - 1).clamp_min(0))
-    lost = lost.index_copy(0, rows, _is_out_of_reach(made, some.T_cam_obj))
+    lost = lost.index_copy(0, rows, _is_out_of_reach(frames, made, some.T_cam_obj))
     everyone = replace(
         everyone,
         frame_index=detections.frame_index,
@@ -190,14 +191,18 @@ def _made_of_masks(
     return everyone, lost
 
 
-def _is_out_of_reach(made: Detections, T_cam_obj: Tensor) -> Tensor:
-    """Whether (B,) some pose of cars is farther from the given ones (B, 4, 4) than a refinement goes."""
+def _is_out_of_reach(frames: FrameBatch, made: Detections, T_cam_obj: Tensor) -> Tensor:
+    """Whether (B,) some pose of cars is farther from the given ones (B, 4, 4) than a refinement goes.
+
+    Depths of stereo are off by more, the farther the car.
+    """
     assert made.other_T_cam_obj is not None
     poses = torch.cat([made.T_cam_obj[:, None], made.other_T_cam_obj], dim=1)
-    moved_m = (poses[..., 0:3:2, 3] - T_cam_obj[:, None, 0:3:2, 3]).norm(dim=-1)
+    off_m = (poses[..., 0:3:2, 3] - T_cam_obj[:, None, 0:3:2, 3]).norm(dim=-1)
     cos_turned = (poses[..., :3, 0] * T_cam_obj[:, None, :3, 0]).sum(dim=-1).abs()
+    is_far = off_m > _REACH_M + depth_noise(frames, made.frame_index, poses[..., 2, 3])
     # NaN, for a mask without a car, is not farther.
-    return ((moved_m > _REACH_M) | (cos_turned < math.cos(_REACH_RAD))).any(dim=1)
+    return (is_far | (cos_turned < math.cos(_REACH_RAD))).any(dim=1)
 
 
 @torch.no_grad()

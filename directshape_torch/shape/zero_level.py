@@ -42,20 +42,23 @@ def zero_level_extents(
 
 def _extent_along(values: Tensor, axis: int) -> tuple[Tensor, Tensor]:
     """First and last crossing (B,), (B,) over all edges of one axis, in nodes; NaN where there is none."""
-    count = values.shape[axis]
-    before, after = values.narrow(axis, 0, count - 1), values.narrow(axis, 1, count - 1)
-    crosses = (before < 0) != (after < 0)
-    drop = torch.where(crosses, before - after, torch.ones_like(before))
-    shape = [1, 1, 1, 1]
-    shape[axis] = count - 1
-    node = torch.arange(count - 1, dtype=values.dtype, device=values.device).reshape(shape)
-    position = node + before / drop
-    nothing = torch.full_like(position, float("inf"))
-    first = torch.where(crosses, position, nothing).flatten(1).amin(dim=1)
-    last = torch.where(crosses, position, -nothing).flatten(1).amax(dim=1)
-    found = crosses.flatten(1).any(dim=1)
-    nan = torch.full_like(first, float("nan"))
-    return torch.where(found, first, nan), torch.where(found, last, nan)
+    values = values.movedim(axis, 1)
+    is_inside = values < 0
+    # The outermost crossing lies between the outermost two neighbouring layers of nodes that a crossing lies between.
+    is_crossed = (is_inside[:, :-1] != is_inside[:, 1:]).any(dim=3).any(dim=2)
+    found, cars = is_crossed.any(dim=1), torch.arange(len(values), device=values.device)
+
+    def between(layer: Tensor, nothing: float) -> Tensor:
+        """Crossings (B, ...) between a layer (B,) and the next one."""
+        before, after = values[cars, layer], values[cars, layer + 1]
+        crosses = (before < 0) != (after < 0)
+        drop = torch.where(crosses, before - after, torch.ones_like(before))
+        return torch.where(crosses, layer[:, None, None] + before / drop, nothing).flatten(1)
+
+    last_layer = is_crossed.shape[1] - 1 - is_crossed.flip(1).byte().argmax(dim=1)
+    first = between(is_crossed.byte().argmax(dim=1), torch.inf).amin(dim=1)
+    last = between(last_layer, -torch.inf).amax(dim=1)
+    return torch.where(found, first, torch.nan), torch.where(found, last, torch.nan)
 
 
 def sdf_to_mesh(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -97,37 +96,38 @@ def with_disparity(frames: FrameBatch, frame_index: Tensor | None = None, extent
         return frames
     maps = torch.full_like(frames.images_left[:, 0], torch.nan)
     for k, (height, width) in enumerate(frames.sizes.tolist()):
-        if frame_index is None or extents is None:
-            is_needed = np.full((height, width), frame_index is None or k in frame_index.tolist())
-        else:
-            is_needed = _around(extents[frame_index == k], height, width)
-        for own, rows, columns in _regions(is_needed):
-            first = max(columns.start - _NUM_DISPARITIES, 0)
-            pair = (
-                rgb8(images[k, :, rows, first : columns.stop]) for images in (frames.images_left, frames.images_right)
-            )
-            matched = torch.from_numpy(match_disparity(*pair, context_px=columns.start - first)).to(maps)
-            part = maps[k, rows, columns]
-            part.copy_(torch.where(torch.from_numpy(own).to(maps.device), matched, part))
+        parts = [[0, 0, width, height]]
+        if frame_index is not None:
+            is_here = frame_index == k
+            parts = parts[: int(is_here.any())] if extents is None else extents[is_here].tolist()
+        for u0, v0, u1, v1 in _apart(parts, height, width):
+            first = max(u0 - _NUM_DISPARITIES, 0)
+            pair = (rgb8(images[k, :, v0:v1, first:u1]) for images in (frames.images_left, frames.images_right))
+            maps[k, v0:v1, u0:u1] = torch.from_numpy(match_disparity(*pair, context_px=u0 - first)).to(maps)
     return replace(frames, disparity=maps)
 
 
-def _around(extents: Tensor, height: int, width: int) -> NDArray[np.bool_]:
-    """The pixels (H, W) of parts (M, 4) of an image and those around them."""
-    around = np.zeros((height, width), dtype=np.bool_)
-    for u0, v0, u1, v1 in extents.tolist():
-        if u1 > u0 and v1 > v0:
-            around[max(v0 - _AROUND_PX, 0) : v1 + _AROUND_PX, max(u0 - _AROUND_PX, 0) : u1 + _AROUND_PX] = True
-    return around
+def _apart(parts: list[list[int]], height: int, width: int) -> list[list[int]]:
+    """Rectangles around parts of an image and the pixels around them; those that overlap are united."""
+    apart: list[list[int]] = []
+    for u0, v0, u1, v1 in parts:
+        if u0 >= u1 or v0 >= v1:
+            continue
+        part = [
+            max(u0 - _AROUND_PX, 0),
+            max(v0 - _AROUND_PX, 0),
+            min(u1 + _AROUND_PX, width),
+            min(v1 + _AROUND_PX, height),
+        ]
+        while (other := next((each for each in apart if _overlap(each, part)), None)) is not None:
+            apart.remove(other)
+            part = [*map(min, part[:2], other[:2]), *map(max, part[2:], other[2:])]
+        apart.append(part)
+    return apart
 
 
-def _regions(pixels: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.bool_], slice, slice]]:
-    """The connected regions of some pixels (H, W) with the rows and columns that they lie in."""
-    from scipy.ndimage import find_objects, label
-
-    labels, _ = label(pixels)
-    for number, (rows, columns) in enumerate(find_objects(labels), start=1):
-        yield labels[rows, columns] == number, rows, columns
+def _overlap(a: list[int], b: list[int]) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
 def rgb8(
