@@ -23,6 +23,7 @@ from directshape_torch.rows import PixelSamples, PointSamples, Rays, Rows
 from directshape_torch.scene.detections import Detections
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.sharing import Groups
 from directshape_torch.state.cars import CarBatch, CarState
 from directshape_torch.state.unknowns import State
@@ -120,16 +121,16 @@ class Bench:
             _check_refused(config, prior, scene, detections, cars, seen, own_terms)
         terms = _named(*stages)
         prepared = stages[0].problem.prepare(drawn.state)
-        rows = {name: rows_at(term, prepared) for name, term in terms.items()}
+        rows = {name: rows_at(term, prior, prepared) for name, term in terms.items()}
         return cls(regime, stages[0], terms, drawn.state, prepared, rows)
 
 
 @torch.no_grad()
-def rows_at(term: Term[AnchorT], prepared: Prepared) -> Linear[AnchorT]:
+def rows_at(term: Term[AnchorT], prior: ShapePrior, prepared: Prepared) -> Linear[AnchorT]:
     """The rows of a term at a state, with depths as precise as the dtype allows."""
-    at = linear_of(term, prepared.field, prepared.state, term.anchor(prepared))
+    at = linear_of(term, prior, prepared.field, prepared.state, term.anchor(prepared))
     for _ in range(_ROUNDS):
-        at = linear_of(term, prepared.field, prepared.state, at.anchor)
+        at = linear_of(term, prior, prepared.field, prepared.state, at.anchor)
     return at
 
 
@@ -174,7 +175,7 @@ def _check_refused(
         prepared = few.prepare(state)
         stage = config.stages[0]
         products = [
-            car_products(term, prepared.field, state, term.anchor(prepared))
+            car_products(term, prior, prepared.field, state, term.anchor(prepared))
             for term in (before.begin(stage, prepared), now.begin(stage, prepared))
         ]
         called = f"extra term {now.names[0]!r} of the cars that were not refused"

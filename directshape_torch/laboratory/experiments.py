@@ -52,8 +52,8 @@ class Experiment:
 def term_experiment(bench: Bench, names: Sequence[str]) -> Experiment:
     """The experiment on every counted residual of the named terms of a bench, by twist and code.
 
-    `Term.linear` gives the hand-derived Jacobian, and autograd differentiates `Term.residual` at equal points.
-    Differences use the residuals that `Term.linear` gives at displaced states, with anchors anew, as it does for the
+    `linear_of` gives the hand-derived Jacobian, and autograd differentiates `Term.residual` at equal points.
+    Differences use the residuals that `linear_of` gives at displaced states, with anchors anew, as it does for the
     solver.
     """
     terms = [bench.terms[name] for name in names]
@@ -66,7 +66,7 @@ def term_experiment(bench: Bench, names: Sequence[str]) -> Experiment:
         field = field_of(bench.problem.prior.bind(state.code))
         residuals = (
             term.residual(field, state, at.anchor) if name in AT_FIXED_DEPTHS
-            else term.linear(field, state, at.anchor).residual
+            else linear_of(term, bench.problem.prior, field, state, at.anchor).residual
             for name, term, at in zip(names, terms, rows, strict=True)
         )  # fmt: skip
         return [residual[count] for residual, count in zip(residuals, counts, strict=True)]
@@ -81,7 +81,7 @@ def term_experiment(bench: Bench, names: Sequence[str]) -> Experiment:
 def gradient_experiment(bench: Bench, names: Sequence[str]) -> Experiment:
     """The experiment on the gradients `w rho'(r) J` (D,) of each row of the named terms, by twist and code.
 
-    The derivatives of gradients are second derivatives. `Term.linear` is differentiated as gradients through a
+    The derivatives of gradients are second derivatives. `linear_of` is differentiated as gradients through a
     refinement differentiate it. There is no hand-derived form, so both Jacobians of a subject come from autograd.
     """
     terms = [bench.terms[name] for name in names]
@@ -90,8 +90,9 @@ def gradient_experiment(bench: Bench, names: Sequence[str]) -> Experiment:
 
     def gradients(delta: Tensor) -> list[Tensor]:
         state = bench.moved(delta)
-        field = field_of(bench.problem.prior.bind(state.code))
-        moved = (linear_of(term, field, state, at.anchor) for term, at in zip(terms, rows, strict=True))
+        prior = bench.problem.prior
+        field = field_of(prior.bind(state.code))
+        moved = (linear_of(term, prior, field, state, at.anchor) for term, at in zip(terms, rows, strict=True))
         return [row_gradients(t, at)[m].flatten() for t, at, m in zip(terms, moved, moving, strict=True)]
 
     jacobians = torch.func.jacfwd(gradients)(torch.zeros_like(_units(bench)))

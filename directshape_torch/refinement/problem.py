@@ -82,7 +82,7 @@ class CarProblem(Table):
         """
         own = len(terms) - len(self.extra_terms)
         extra = zip(terms[own:], anchors[own:], strict=True)
-        of_extra = tuple(part_of(term, linear_of(term, field, state, anchor)) for term, anchor in extra)
+        of_extra = tuple(part_of(term, linear_of(term, self.prior, field, state, anchor)) for term, anchor in extra)
         # Compiled code always computes the Fisher information, so that it has one form.
         return parts_of(terms[:own], field, state, anchors[:own], fisher or will_compile()) + of_extra
 

@@ -19,11 +19,8 @@ from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.rows import Rows
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
-from directshape_torch.shape.field import field_of
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.state.cars import CarBatch, CarState
-from directshape_torch.terms.check_term import check_members, check_term, named_errors
-from directshape_torch.terms.derived import with_jacobian
 from directshape_torch.terms.photometric import PhotometricEvidence
 from directshape_torch.terms.photometric_rows import LeftPixels
 from directshape_torch.terms.point_cloud import PointCloud
@@ -70,35 +67,37 @@ def problem_of_scene(
         left = LeftPixels(pixels[0], sides[0], pyramid, observation.hidden_right, detections.mask_left)
         evidence.append(PhotometricEvidence(config.photometric, cars, left))
     evidence += prior_terms(config.priors, prior, cars)
-    extra = [_made(make, frames, detections, cars, prior) for make in extra_terms]
-    if not evidence and not extra:
+    if not evidence and not extra_terms:
         raise ConfigError(f"expected a term of weight above 0, got none: {_WEIGHTS}")
-    problem = CarProblem(prior, tuple(evidence), tuple(extra), masks, config)
-    _check_extra(problem, cars)
+    problem = CarProblem(prior, tuple(evidence), (), masks, config)
+    if extra_terms:
+        problem = _with_extra_terms(problem, extra_terms, frames, detections, cars)
     factors = _factors(term_weights, problem.term_names, prior.initial_code(len(detections)).to(frames.images_left))
     return problem if factors is None else replace(problem, factors=factors[cars.detection_row])
 
 
-def _made(make: TermFactory, frames: FrameBatch, detections: Detections, cars: CarBatch, prior: ShapePrior) -> AnyTerm:
-    """Make a user's term; errors of the factory are named, because tensors of all detections do not fit the cars."""
-    called = f"extra term of {getattr(make, '__qualname__', type(make).__name__)}"
-    cure = "the cars are the rows cars.detection_row of the detections: take these rows of other tensors too"
-    with named_errors(called, len(cars), cure):
-        term = make(frames, detections, cars, prior)
-    check_members(term)
-    return with_jacobian(term, prior)
+def _with_extra_terms(
+    problem: CarProblem, factories: Sequence[TermFactory], frames: FrameBatch, detections: Detections, cars: CarBatch
+) -> CarProblem:
+    """The problem with a user's terms, after a check at the detector's poses that they obey `Term`."""
+    # The import stands here, because only terms of a user are checked.
+    from directshape_torch.terms.check_term import check_members, check_term, named_errors
 
-
-def _check_extra(problem: CarProblem, cars: CarBatch) -> None:
-    """Raise `InputError` unless a user's terms obey `Term` at the detector's poses."""
-    if not problem.extra_terms:
-        return
+    extra = []
+    for make in factories:
+        called = f"extra term of {getattr(make, '__qualname__', type(make).__name__)}"
+        cure = "the cars are the rows cars.detection_row of the detections: take these rows of other tensors too"
+        # Tensors of all detections do not fit the cars.
+        with named_errors(called, len(cars), cure):
+            extra.append(make(frames, detections, cars, problem.prior))
+        check_members(extra[-1])
     code = problem.prior.initial_code(len(cars)).to(cars.detector_T_cam_obj)
     prepared = problem.prepare(CarState.of(se3.inverse(cars.detector_T_cam_obj), code, cars.num_offsets))
-    names = [name for each in problem.evidence for name in each.names]
-    for term in problem.extra_terms:
-        check_term(term, problem.stages()[0], prepared, names, lambda code: field_of(problem.prior.bind(code)))
+    names = list(problem.term_names)
+    for term in extra:
+        check_term(term, problem.prior, problem.stages()[0], prepared, names)
         names += term.names
+    return replace(problem, extra_terms=tuple(extra))
 
 
 def _pyramid(frames: FrameBatch, num_halvings: int) -> tuple[GreyPair, ...]:

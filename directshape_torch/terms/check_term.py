@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 import torch
@@ -15,9 +15,10 @@ from directshape_torch.numerics.checks import check_shape
 from directshape_torch.numerics.gradient_mode import map_tensors
 from directshape_torch.numerics.tables import Chosen, declared, is_table, of
 from directshape_torch.rows import Blocks
-from directshape_torch.shape.field import Field
+from directshape_torch.shape.field import Field, field_of
+from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.state.unknowns import CODE, OFFSET, POSE, State
-from directshape_torch.terms.term import AnchorT, AnyTerm, Linear, Prepared, Term, linear_of, part_of
+from directshape_torch.terms.term import AnchorT, AnyTerm, Linear, Prepared, Term, has_linear, linear_of, part_of
 
 _OWN = ("names", "blocks", "block_weight", "information", "row_weight", "residual", "norm")
 _DEFAULTS = ("sees", "is_prior", "column", "begin", "changing_rows", "anchor", "linear")
@@ -46,7 +47,7 @@ def check_members(term: AnyTerm) -> None:
 
 @torch.no_grad()
 def check_term(
-    term: AnyTerm, stage: StageConfig, prepared: Prepared, taken: Collection[str], field_at: Callable[[Tensor], Field]
+    term: AnyTerm, prior: ShapePrior, stage: StageConfig, prepared: Prepared, taken: Collection[str]
 ) -> None:
     """Raise `InputError` unless all values of a term at a state have the types and shapes that `Term` requires.
 
@@ -54,10 +55,10 @@ def check_term(
 
     Args:
         term: term of B cars before any stage, with all members (`check_members`).
+        prior: family of shapes.
         stage: first stage.
         prepared: any state of these cars.
         taken: names of other terms.
-        field_at: the shapes of codes (B, K).
     """
     names, called = term.names, f"extra term {term.names[0]!r}"
     if len(set(names)) < len(names) or not set(names).isdisjoint(taken):
@@ -66,14 +67,14 @@ def check_term(
     _check_fields(called, term, {"B": num_cars})
     begun = term.begin(stage, prepared)
     _check_rows(f"{called} after begin(...)", begun, num_cars)
-    _check_linear(f"{called}: linear(...)", begun, begun.anchor(prepared), prepared.field, prepared.state)
+    _check_linear(f"{called}: linear(...)", begun, prior, prepared, begun.anchor(prepared))
     changing, anchor, resting = begun.changing_rows(prepared, False)
     _check_rows(f"{called} after changing_rows(...)", changing, num_cars)
-    _check_linear(f"{called} after changing_rows(...): linear(...)", changing, anchor, prepared.field, prepared.state)
+    _check_linear(f"{called} after changing_rows(...): linear(...)", changing, prior, prepared, anchor)
     check_shape(
         f"{called}: the cost of changing_rows(...)", resting, (num_cars, len(names)), "one for each car and name"
     )
-    before = car_products(changing, prepared.field, prepared.state, anchor)
+    before = car_products(changing, prior, prepared.field, prepared.state, anchor)
     # The remaining cars are every other car, the last car, or none; in the first two cases all cars get new numbers.
     for numbers in dict.fromkeys((tuple(range(1, num_cars, 2)), tuple(range(num_cars))[-1:], ())):
         if len(numbers) < num_cars:
@@ -81,13 +82,13 @@ def check_term(
             keep[list(numbers)] = True
             left, few = f"{called} after of(cars)", of(prepared.state, Chosen(keep, numbers))
             with named_errors(left, len(numbers)):
-                now = _products_of(Chosen(keep, numbers), changing, anchor, few, field_at(few.code))
+                now = _products_of(Chosen(keep, numbers), changing, prior, anchor, few)
             check_same(left, now, before, numbers)
 
 
-def car_products(term: Term[AnchorT], field: Field, state: State, anchor: AnchorT) -> Tensor:
+def car_products(term: Term[AnchorT], prior: ShapePrior, field: Field, state: State, anchor: AnchorT) -> Tensor:
     """Sums of a term for its cars (B, D + 1, D): the Gauss-Newton matrix, and the gradient as its last row."""
-    products = part_of(term, linear_of(term, field, state, anchor), fisher=False).products
+    products = part_of(term, linear_of(term, prior, field, state, anchor), fisher=False).products
     sums = products.new_zeros(len(state.code), *products.shape[1:])
     return sums.index_add(0, term.blocks.owner, products * term.block_weight[:, None, None])
 
@@ -104,10 +105,11 @@ def check_same(called: str, now: Tensor, before: Tensor, numbers: Sequence[int])
         raise InputError(called, "the rows that each car had before", f"others of car {car}", _LEAVING)
 
 
-def _products_of(cars: Chosen, term: Term[AnchorT], anchor: AnchorT, few: State, field: Field) -> Tensor:
+def _products_of(cars: Chosen, term: Term[AnchorT], prior: ShapePrior, anchor: AnchorT, few: State) -> Tensor:
     """The sums of some cars, computed as in an iteration after the other cars have left."""
     blocks = term.blocks.kept(cars)
-    return car_products(term.of(cars), field, few, map_tensors(lambda x: x.index_select(-2, blocks), anchor))
+    anchor = map_tensors(lambda x: x.index_select(-2, blocks), anchor)
+    return car_products(term.of(cars), prior, field_of(prior.bind(few.code)), few, anchor)
 
 
 @contextmanager
@@ -174,10 +176,11 @@ def _check_numbers(called: str, numbers: Tensor, count: int, of_what: str) -> No
         raise InputError(called, f"numbers of the {count} {of_what}", got, "number the cars of this batch from 0")
 
 
-def _check_linear(called: str, term: Term[AnchorT], anchor: AnchorT, field: Field, state: State) -> None:
+def _check_linear(called: str, term: Term[AnchorT], prior: ShapePrior, prepared: Prepared, anchor: AnchorT) -> None:
     """Check that the factors of the Jacobian, the residuals and the norms fit the rows."""
+    field, state = prepared.field, prepared.state
     with named_errors(called, len(state.code)):
-        at = term.linear(field, state, anchor)
+        at = term.linear(field, state, anchor) if has_linear(term) else linear_of(term, prior, field, state, anchor)
     if not isinstance(at, Linear):
         raise InputError(called, "a Linear", type(at).__name__)
     of_rows = tuple(term.row_weight.shape)

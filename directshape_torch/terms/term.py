@@ -16,6 +16,7 @@ from torch import Tensor
 
 from directshape_torch.compile import compilable
 from directshape_torch.config import StageConfig
+from directshape_torch.errors import InputError
 from directshape_torch.kernels.arguments import Sums
 from directshape_torch.kernels.choice import array
 from directshape_torch.numerics.tables import Table
@@ -145,8 +146,8 @@ class Term(Table, Protocol[AnchorT]):
     def linear(self, field: Field, state: State, anchor: AnchorT) -> Linear[AnchorT]:
         """Return residuals with their hand-derived Jacobian; rows are evaluated near `anchor`, of a nearby state.
 
-        A user's term may omit this method: `terms.derived` then differentiates its `residual`. With gradients enabled
-        the result is differentiable by the state and by all tensors of the term.
+        A user's term may omit this method: `linear_of` then differentiates its `residual`. With gradients enabled the
+        result is differentiable by the state and by all tensors of the term.
         """
         ...
 
@@ -194,9 +195,31 @@ def part_to_write(
     return part, Sums(first, *map(array, (cost, products, into, residual)))
 
 
-def linear_of(term: Term[AnchorT], field: Field, state: State, anchor: AnchorT) -> Linear[AnchorT]:
-    """`term.linear` with a column for each unknown of the state; columns of unseen unknowns are zero."""
-    at = term.linear(field, state, anchor)
+def linear_of(term: Term[AnchorT], prior: ShapePrior, field: Field, state: State, anchor: AnchorT) -> Linear[AnchorT]:
+    """`term.linear` with a column for each unknown of the state; columns of unseen unknowns are zero.
+
+    Where a term has none its `residual` is differentiated, which is slow.
+
+    Raises:
+        InputError: a term without `linear` has several residuals a row.
+    """
+    if has_linear(term):
+        return in_all_columns(term, state, term.linear(field, state, anchor))
+    ((residual, J),) = by_autograd([term], prior, state, [anchor])
+    if residual.shape[-1:] != (1,):
+        cure = "write linear(...) by hand, which may give several residuals of a row one inner scalar"
+        called = f"extra term {term.names[0]!r}: residual(...)"
+        raise InputError(called, "one residual a row, shape (M, R, 1)", f"{tuple(residual.shape)}", cure)
+    return Linear(residual, torch.ones_like(residual), J[:, :, 0], anchor)
+
+
+def has_linear(term: AnyTerm) -> bool:
+    """Whether a term has a `linear` of its own."""
+    return inspect.getattr_static(term, "linear") is not vars(Term)["linear"]
+
+
+def in_all_columns(term: Term[AnchorT], state: State, at: Linear[AnchorT]) -> Linear[AnchorT]:
+    """What a term's own `linear` gives, with a column for each unknown of the state."""
     return at._replace(J_inner_state=state.unknowns.placed(at.J_inner_state, term.sees))
 
 
@@ -239,7 +262,7 @@ def parts_of(
 
     def of(term: AnyTerm, anchor: object) -> Part[Any]:
         native = term.native_part(field, state, anchor, fisher)
-        return native or part_of(term, linear_of(term, field, state, anchor), fisher)
+        return native or part_of(term, in_all_columns(term, state, term.linear(field, state, anchor)), fisher)
 
     return tuple(map(of, terms, anchors))
 

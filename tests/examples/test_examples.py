@@ -79,7 +79,7 @@ def test_the_jacobian_of_the_upright_prior_is_right() -> None:
     problem, state = DirectShapeRefiner(None, exact, [of["upright_prior"]]).problem(*_demo(of))
     state = state.unknowns.retract(state, 0.2 * torch.randn(len(state.code), state.unknowns.size))
     (term,) = problem.extra_terms
-    at = linear_of(term, field_of(problem.prior.bind(state.code)), state, ())
+    at = linear_of(term, problem.prior, field_of(problem.prior.bind(state.code)), state, ())
     ((residual, jacobian),) = by_autograd([term], problem.prior, state, [()])
     torch.testing.assert_close(at.residual, residual)
     torch.testing.assert_close(at.J_residual_inner[..., None] * at.J_inner_state[:, :, None], jacobian.to(at.residual))

@@ -14,7 +14,7 @@ from directshape_torch.laboratory.bench import Bench
 from directshape_torch.numerics.tables import Chosen
 from directshape_torch.shape.field import Field, field_of
 from directshape_torch.state.unknowns import State
-from directshape_torch.terms.term import AnyTerm, Part, linear_of, part_of, parts_of
+from directshape_torch.terms.term import AnyTerm, Part, in_all_columns, part_of, parts_of
 
 NAMES = ("silhouettes", "photometric")
 
@@ -33,7 +33,10 @@ class Rows(NamedTuple):
         return part
 
     def by_tensors(self) -> Part[Any]:
-        return part_of(self.term, linear_of(self.term, self.field, self.state, self.anchor))
+        return part_of(
+            self.term,
+            in_all_columns(self.term, self.state, self.term.linear(self.field, self.state, self.anchor)),
+        )
 
 
 @pytest.fixture(autouse=True)

@@ -98,7 +98,7 @@ def test_sums_are_those_of_single_residuals(bench_of: BenchOf, regime: str) -> N
     figures = stage.figures(bench.prepared)
     column = 0
     for number_of_term, term in enumerate(stage.terms):
-        at = linear_of(term, bench.prepared.field, bench.state, term.anchor(bench.prepared))
+        at = linear_of(term, bench.problem.prior, bench.prepared.field, bench.state, term.anchor(bench.prepared))
         norm, J = term.norm(at.residual), jacobian(at)
         assert torch.equal(figures.parts[number_of_term].residual, at.residual)
         for number in range(len(term.names)):
