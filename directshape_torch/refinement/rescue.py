@@ -202,7 +202,8 @@ def _is_out_of_reach(frames: FrameBatch, made: Detections, T_cam_obj: Tensor) ->
     cos_turned = (poses[..., :3, 0] * T_cam_obj[:, None, :3, 0]).sum(dim=-1).abs()
     is_far = off_m > _REACH_M + depth_noise(frames, made.frame_index, poses[..., 2, 3])
     # NaN, for a mask without a car, is not farther.
-    return (is_far | (cos_turned < math.cos(_REACH_RAD))).any(dim=1)
+    is_elsewhere: Tensor = is_far | (cos_turned < math.cos(_REACH_RAD))
+    return is_elsewhere.any(dim=1)
 
 
 @torch.no_grad()

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError, MeshError
 from directshape_torch.numerics.checks import check_shape
+from directshape_torch.numerics.tensors import constant_like
 
 if TYPE_CHECKING:
     import trimesh
@@ -44,21 +45,19 @@ def _extent_along(values: Tensor, axis: int) -> tuple[Tensor, Tensor]:
     """First and last crossing (B,), (B,) over all edges of one axis, in nodes; NaN where there is none."""
     values = values.movedim(axis, 1)
     is_inside = values < 0
-    # The outermost crossing lies between the outermost two neighbouring layers of nodes that a crossing lies between.
+    # The outermost crossings lie between the outermost layers of nodes that a crossing lies between.
     is_crossed = (is_inside[:, :-1] != is_inside[:, 1:]).any(dim=3).any(dim=2)
-    found, cars = is_crossed.any(dim=1), torch.arange(len(values), device=values.device)
-
-    def between(layer: Tensor, nothing: float) -> Tensor:
-        """Crossings (B, ...) between a layer (B,) and the next one."""
-        before, after = values[cars, layer], values[cars, layer + 1]
-        crosses = (before < 0) != (after < 0)
-        drop = torch.where(crosses, before - after, torch.ones_like(before))
-        return torch.where(crosses, layer[:, None, None] + before / drop, nothing).flatten(1)
-
-    last_layer = is_crossed.shape[1] - 1 - is_crossed.flip(1).byte().argmax(dim=1)
-    first = between(is_crossed.byte().argmax(dim=1), torch.inf).amin(dim=1)
-    last = between(last_layer, -torch.inf).amax(dim=1)
-    return torch.where(found, first, torch.nan), torch.where(found, last, torch.nan)
+    both_ways = torch.stack([is_crossed, is_crossed.flip(1)]).byte().argmax(dim=2)
+    sign = constant_like((1.0, -1.0), values)
+    layer = torch.where(sign[:, None] > 0, both_ways, is_crossed.shape[1] - 1 - both_ways)
+    cars = torch.arange(len(values), device=values.device)
+    before, after = values[cars, layer], values[cars, layer + 1]
+    crosses = (before < 0) != (after < 0)
+    drop = torch.where(crosses, before - after, torch.ones_like(before))
+    position = (layer[..., None, None] + before / drop) * sign.view(2, 1, 1, 1)
+    outermost = torch.where(crosses, position, torch.inf).flatten(2).amin(dim=2) * sign[:, None]
+    first, last = torch.where(is_crossed.any(dim=1), outermost, torch.nan)
+    return first, last
 
 
 def sdf_to_mesh(

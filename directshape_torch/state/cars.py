@@ -61,6 +61,8 @@ class CarBatch(Table):
     detector_pose_sigma: Annotated[Tensor | None, Dense("B", 4)]
     # standard deviation of the unknown offset of the disparity; None where no car has an unknown offset
     offset_sigma_px: Annotated[Tensor | None, Dense("B")]
+    # change of the inverse depth, per metre, by a pixel of that offset; 0 where the offset is known
+    inverse_depth_of_pixel: Annotated[Tensor | None, Dense("B", 1)]
     # standard deviation of the rig's disparity field at the car; 0 where the offset is an unknown
     field_sigma_px: Annotated[Tensor, Dense("B")]
     track_id: Annotated[Tensor | None, Dense("B", kind="index")]  # see `Detections`
@@ -83,7 +85,10 @@ class CarBatch(Table):
         elif not bool((offset_sigma_px > 0).any()):
             offset_sigma_px = None
         field_sigma_px = frames.camera.field_sigma_px(f, detections.T_cam_obj[:, :3, 3])
+        inverse_depth_of_pixel = None
         if offset_sigma_px is not None:
+            per_px = 1 / (frames.camera.K_left[f, 0, 0] * frames.camera.baseline[f])
+            inverse_depth_of_pixel = torch.where(offset_sigma_px > 0, per_px, 0.0)[:, None]
             # An unknown offset already accounts for the error of the disparity field.
             field_sigma_px = field_sigma_px.masked_fill(offset_sigma_px > 0, 0.0)
         return cls(
@@ -100,6 +105,7 @@ class CarBatch(Table):
             detector_T_cam_obj=detections.T_cam_obj,
             detector_pose_sigma=detections.pose_sigma,
             offset_sigma_px=offset_sigma_px,
+            inverse_depth_of_pixel=inverse_depth_of_pixel,
             field_sigma_px=field_sigma_px,
             track_id=detections.track_id,
             time_s=None if frames.time_s is None else frames.time_s[f],
@@ -132,6 +138,5 @@ class CarBatch(Table):
 
     def inverse_depth_of_offset(self, offset_px: Tensor) -> Tensor:
         """Change of the inverse depth (B, 1), per metre, by offsets (B, 1) of the disparity; 0 where they are known."""
-        assert self.offset_sigma_px is not None
-        per_px = torch.where(self.offset_sigma_px > 0, 1 / self.focal_baseline, 0.0)
-        return offset_px * per_px[:, None]
+        assert self.inverse_depth_of_pixel is not None
+        return offset_px * self.inverse_depth_of_pixel

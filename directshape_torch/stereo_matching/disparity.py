@@ -102,8 +102,8 @@ def with_disparity(frames: FrameBatch, frame_index: Tensor | None = None, extent
             parts = parts[: int(is_here.any())] if extents is None else extents[is_here].tolist()
         for u0, v0, u1, v1 in _apart(parts, height, width):
             first = max(u0 - _NUM_DISPARITIES, 0)
-            pair = (rgb8(images[k, :, v0:v1, first:u1]) for images in (frames.images_left, frames.images_right))
-            maps[k, v0:v1, u0:u1] = torch.from_numpy(match_disparity(*pair, context_px=u0 - first)).to(maps)
+            left, right = (rgb8(x[k, :, v0:v1, first:u1]) for x in (frames.images_left, frames.images_right))
+            maps[k, v0:v1, u0:u1] = torch.from_numpy(match_disparity(left, right, context_px=u0 - first)).to(maps)
     return replace(frames, disparity=maps)
 
 

@@ -12,6 +12,7 @@ docs/derivations/photometric.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Literal, NamedTuple
 
 import torch
@@ -182,7 +183,8 @@ class Photometric(Term[Surface]):
         found, J_depth_state = surface.found, surface.J_depth_state
         depth, ratio = warped_depth(self.cars, surface.depth, state, owner)
         if ratio is not None:
-            J_depth_offset = -depth * depth * self.cars.inverse_depth_of_offset(torch.ones_like(state.offset_px))[owner]
+            assert self.cars.inverse_depth_of_pixel is not None
+            J_depth_offset = -depth * depth * self.cars.inverse_depth_of_pixel[owner]
             J_depth_state = torch.cat([J_depth_state / (ratio * ratio)[..., None], J_depth_offset[..., None]], dim=-1)
         compare = compared(rows, depth)
         usable = found & compare.comparable
@@ -201,16 +203,19 @@ class Photometric(Term[Surface]):
         config, offset = self.config, state.offset_px
         shape = *rows.pixel_weight.shape, len(rows.intensity_left)
         part, sums = part_to_write(self, state, map_tensors(room_like, anchor), shape, False)
-        of_offset = (
-            self.cars.inverse_depth_of_offset(x) if x.shape[1] else x for x in (offset, torch.ones_like(offset))
-        )
+        per_px = self.cars.inverse_depth_of_pixel
+        of_offset = (offset, offset) if per_px is None else (offset * per_px, per_px)
         lost, corner = singles(config.lost_grey_levels, config.huber_grey_levels)
-        of_inverse_depth, per_px = map(array, of_offset)
-        matching = Matching(lost, corner, of_inverse_depth, per_px, CENTRE)
-        pixels = Pixels(*map(array, (*rows[1:-1], *rows.right)))
+        matching = Matching(lost, corner, array(of_offset[0]), array(of_offset[1]), CENTRE)
         before, now = (SurfaceArrays(*map(array, surface)) for surface in (anchor, part.anchor))
-        photometric(grid, _TRACKING, matching, native_rays(rows.rays, state.T_obj_cam), pixels, before, now, sums)
+        rays = native_rays(rows.rays, state.T_obj_cam)
+        photometric(grid, _TRACKING, matching, rays, self._pixel_arrays, before, now, sums)
         return part
+
+    @cached_property
+    def _pixel_arrays(self) -> Pixels:
+        rows = self.pixel_set.rows
+        return Pixels(*map(array, (*rows[1:-1], *rows.right)))
 
     def residual(self, field: Field, state: State, anchor: Surface) -> Tensor:
         rows = self.pixel_set.rows

@@ -158,27 +158,26 @@ def prior_terms(config: PriorConfig, prior: ShapePrior, cars: CarBatch) -> list[
 
 
 def with_joined_priors(terms: Sequence[AnyTerm]) -> tuple[AnyTerm, ...]:
-    """The library's terms with those that are priors joined into one, because an iteration needs only their sum.
+    """The library's terms with its functions of the state joined into one, because an iteration needs only their sum.
 
-    Every prior of the library is a `PriorTerm` of pose and shape. A joined prior needs fewer operations.
+    Each `PriorTerm` of the library has a Jacobian. A joined one needs fewer operations.
     """
-    priors = cast("list[PriorTerm]", [term for term in terms if term.is_prior])
-    others = [term for term in terms if not term.is_prior]
+    priors = [term for term in terms if isinstance(term, PriorTerm)]
+    others = [term for term in terms if not isinstance(term, PriorTerm)]
     return (*others, _joined(priors)) if priors else tuple(others)
 
 
 def _joined(terms: Sequence[PriorTerm]) -> PriorTerm:
-    def residual_of(cars: CarBatch, state: State) -> PriorResidual:
-        unknowns = state.unknowns.only(POSE, CODE)
-        scaled = []
-        for term in terms:
-            at = term.residual_of(cars, state)
-            assert isinstance(at, PriorResidual)  # priors of this library have Jacobians
-            J = unknowns.placed(at.J_residual_state, term.sees)
-            scaled.append([math.sqrt(term.weight) * x for x in (at.residual, J)])
-        return PriorResidual(*(torch.cat(parts, dim=1) for parts in zip(*scaled, strict=True)))
+    scales = tuple(math.sqrt(term.weight) for term in terms for _ in range(term.num_rows))
 
-    return PriorTerm("priors", 1.0, terms[0].cars, residual_of, sum(term.num_rows for term in terms))
+    def residual_of(cars: CarBatch, state: State) -> PriorResidual:
+        at = [cast(PriorResidual, term.residual_of(cars, state)) for term in terms]
+        residual = torch.cat([each.residual for each in at], dim=1)
+        placed = [state.unknowns.placed(x.J_residual_state, term.sees) for x, term in zip(at, terms, strict=True)]
+        scale = constant_like(scales, residual)
+        return PriorResidual(residual * scale, torch.cat(placed, dim=1) * scale[:, None])
+
+    return PriorTerm("priors", 1.0, terms[0].cars, residual_of, len(scales))
 
 
 def detector_pose_sigma(config: PriorConfig, cars: CarBatch) -> Tensor:

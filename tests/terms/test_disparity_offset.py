@@ -18,6 +18,7 @@ from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
+from directshape_torch.state.cars import CarBatch
 from directshape_torch.terms.photometric import warped_depth
 from directshape_torch.terms.priors import rig_prior
 
@@ -71,14 +72,24 @@ def test_an_offset_does_what_a_constant_field_does(level: int) -> None:
     assert found[0][3].min() > 50
 
 
+def test_an_offset_changes_the_inverse_depth_by_focal_length_and_baseline() -> None:
+    scene = rectified_street()
+    sigma_px = torch.tensor([1.0, 0.0]).double()
+    cars = CarBatch.from_scene(scene.frames, replace(scene.detections, offset_sigma_px=sigma_px))
+    per_pixel = 1 / (scene.frames.camera.K_left[0, 0, 0] * 0.53)
+    assert cars.inverse_depth_of_pixel is not None
+    torch.testing.assert_close(
+        cars.inverse_depth_of_pixel, torch.stack([per_pixel, torch.zeros_like(per_pixel)])[:, None]
+    )
+
+
 def test_warp_and_prior_by_hand() -> None:
     """Of 80 px m at 8 m, 10 px: 2 px more come from 80 / 12 m; of 10 px less nothing is left, so nothing is seen."""
     scene = rectified_street()
     stage, state = begun_stage(ellipsoid_prior(), scene.frames, scene.detections, UNSURE)
     term = photometric_of(stage)
-    T_right_cam, sigma_px = term.cars.T_right_cam.clone(), torch.tensor([0.5, 0.0]).double()
-    T_right_cam[:, 0, 3] = -80 / 150
-    cars = replace(term.cars, T_right_cam=T_right_cam, offset_sigma_px=sigma_px)
+    per_pixel, sigma_px = torch.tensor([[1 / 80], [0.0]]).double(), torch.tensor([0.5, 0.0]).double()
+    cars = replace(term.cars, inverse_depth_of_pixel=per_pixel, offset_sigma_px=sigma_px)
     owner, depth = torch.tensor([0, 1]), torch.full((2, 1), 8.0).double()
     nearer, gone = (state._replace(offset_px=torch.full((2, 1), x).double()) for x in (2.0, -10.0))
     torch.testing.assert_close(warped_depth(cars, depth, nearer, owner)[0], torch.tensor([[80 / 12], [8.0]]).double())
