@@ -26,7 +26,7 @@ from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.sharing import INDEPENDENT, Sharing
 from directshape_torch.state.unknowns import LARGEST_ROTATION_RAD, AnyState, State, Unknowns
 from directshape_torch.terms.depth import marched_views
-from directshape_torch.terms.photometric import Photometric, Surface
+from directshape_torch.terms.photometric import Photometric, PhotometricEvidence, Surface
 from directshape_torch.terms.priors import with_joined_priors
 from directshape_torch.terms.silhouette import MaskRows
 from directshape_torch.terms.term import (
@@ -67,9 +67,10 @@ class CarProblem(Table):
     def stages(self) -> tuple[StageConfig, ...]:
         return self.config.stages
 
-    def evidence_of(self, name: str) -> Evidence | None:
-        """The library's evidence that fills the column `name`; None if it has no part in the energy."""
-        return next((each for each in self.evidence if name in each.names), None)
+    @property
+    def photometric(self) -> PhotometricEvidence | None:
+        """The library's photometric evidence; None if it has no part in the energy."""
+        return next((each for each in self.evidence if isinstance(each, PhotometricEvidence)), None)
 
     def parts(
         self, terms: tuple[AnyTerm, ...], field: Field, state: State, anchors: tuple[object, ...], fisher: bool = True
@@ -127,16 +128,10 @@ class CarStage:
         """What the photometric term says among the figures of a state."""
         return next((at for term, at in zip(self.terms, figures.parts, strict=True) if term is self.photometric), None)
 
-    @property
-    def is_prior_column(self) -> list[bool]:
-        """Which of the T columns of costs belong to priors."""
-        return [term.is_prior for term in self.terms for _ in term.names]
-
     def information_of_measurements(self, figures: Figures) -> Tensor | None:
         """The Fisher matrix (B, D, D) of all terms except the priors; None if all terms are priors."""
-        seen = [
-            part for part, prior in zip(figures.information.unbind(1), self.is_prior_column, strict=True) if not prior
-        ]
+        is_prior = [term.is_prior for term in self.terms for _ in term.names]
+        seen = [part for part, prior in zip(figures.information.unbind(1), is_prior, strict=True) if not prior]
         return torch.stack(seen).sum(dim=0) if seen else None
 
     @cached_property

@@ -93,18 +93,11 @@ def newton_step(
 
     The steps are differentiable by the gradient alone.
     """
-    step, regular = general_solution(J.detach(), -gradient.unsqueeze(2))
-    return step.squeeze(2), regular
-
-
-def general_solution(
-    matrix: Tensor,  # (B, D, D), of any kind
-    right: Tensor,  # (B, D, R)
-) -> tuple[Tensor, Tensor]:
-    """Solve `M X = right`; return X (B, D, R), zero where there is no solution, and where (B,) there is one."""
-    info = torch.linalg.lu_factor_ex(matrix)[2]
-    regular = (info == 0) & matrix.flatten(1).isfinite().all(dim=1)
+    J, right = J.detach(), -gradient.unsqueeze(2)
+    info = torch.linalg.lu_factor_ex(J)[2]
+    regular = (info == 0) & J.flatten(1).isfinite().all(dim=1)
     # Where there is no solution the system is replaced, so that no NaN passes into gradients.
-    identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    identity = torch.eye(J.shape[-1], dtype=J.dtype, device=J.device)
     is_regular = regular.view(-1, 1, 1)
-    return torch.linalg.solve(torch.where(is_regular, matrix, identity), torch.where(is_regular, right, 0.0)), regular
+    step = torch.linalg.solve(torch.where(is_regular, J, identity), torch.where(is_regular, right, 0.0))
+    return step.squeeze(2), regular

@@ -13,7 +13,7 @@ from directshape_torch.config import SolverConfig, StageConfig
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.records import Dense
 from directshape_torch.numerics.tables import Chosen, Table
-from directshape_torch.solver.iteration import RUNNING, IterationOutcome, begin, has_failed, iterate, step_lengths
+from directshape_torch.solver.iteration import RUNNING, begin, has_failed, iterate, step_lengths
 from directshape_torch.solver.problem import (
     EvaluationT,
     FiguresT,
@@ -78,10 +78,17 @@ class _Log(Generic[StateT]):
         self.costs: list[Tensor] = []
         self.running: list[Tensor] = []
 
-    def add(self, rows: Tensor, before: tuple[StateT, Tensor, Tensor], outcome: IterationOutcome, cost: Tensor) -> None:
-        """Add one iteration of `rows`: state, damping and stretched steps before it, then its outcome and cost."""
+    def add(
+        self,
+        rows: Tensor,
+        before: tuple[StateT, Tensor, Tensor],
+        outcome: tuple[Tensor, Tensor, Tensor],
+        cost: Tensor,
+    ) -> None:
+        """Add one iteration of `rows`: state, damping and stretched steps before it, then what came of it, and cost."""
+        running, accepted, improved = outcome
         self.costs.append(cost)
-        self.running.append(outcome.running)
+        self.running.append(running)
         if self.trajectory is None:
             return
         state, damping, stretched = before
@@ -93,8 +100,8 @@ class _Log(Generic[StateT]):
                 put_rows(self.all_states, rows, state),
                 zeros.index_copy(0, rows, damping),
                 zeros.index_copy(0, rows, step_lengths(stretched, self.over_relaxation).to(damping.dtype)),
-                none.index_copy(0, rows, outcome.accepted),
-                none.index_copy(0, rows, outcome.improved),
+                none.index_copy(0, rows, accepted),
+                none.index_copy(0, rows, improved),
             )
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Generic, NamedTuple
+from typing import Annotated, Generic
 
 import torch
 from torch import Tensor
@@ -48,14 +48,6 @@ _LEAST_DAMPING, _MOST_DAMPING = 1e-7, 1e5
 # Where a refused step promises and changes at most this many tolerances of the cost, it is not too long: the cost is at
 # its lowest and rough, and more damping would not help.
 _FLAT = 10.0
-
-
-class IterationOutcome(NamedTuple):
-    """An `IterationOutcome` says what an iteration did to each problem, (B,) bool."""
-
-    running: Tensor  # the problem took part
-    accepted: Tensor  # the step was taken
-    improved: Tensor  # the step led to the best state
 
 
 @dataclass
@@ -120,7 +112,7 @@ def iterate(
     config: SolverConfig,
     limits: Tensor,
     over_relaxation: float = 1.0,
-) -> IterationOutcome:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Do one iteration of a batch, and write it into the progress.
 
     Args:
@@ -129,6 +121,9 @@ def iterate(
         config: damping, acceptance, convergence.
         limits: (D,) largest trusted step of each unknown.
         over_relaxation: factor of the stage's longer steps.
+
+    Returns:
+        For each problem (B,) whether it took part, whether its step was taken, and whether it led to the best state.
     """
     share, running = problem.sharing, p.ended < 0
     step, solvable = share.damped_step(p.at_state.hessian, p.at_state.gradient, p.damping, running)
@@ -167,7 +162,7 @@ def iterate(
     astray = running if config.accept_every_step else left
     p.ended = p.ended.masked_fill(astray & solvable & ~finite, Status.non_finite.code)
     improved = _move(problem, p, candidate, at_candidate, accepted, config)
-    return IterationOutcome(running, accepted, improved)
+    return running, accepted, improved
 
 
 def _move(

@@ -43,22 +43,18 @@ class InstancePoints(NamedTuple):
     is_end_seen: Tensor  # (M, 2) bool, false where the border of the image or a nearer object cuts the mask off
 
 
-class Rectangles(NamedTuple):
-    """`Rectangles` are C fitted rectangles of each of M instances."""
-
-    place: Tensor  # (M, C, 5) x and z of the centre, metres, heading `rotation_y`, radians, length and width, metres
-    cost: Tensor  # (M, C) mean robust cost, square metres
-
-
-def fit_rectangles(seen: InstancePoints) -> Rectangles:
+def fit_rectangles(seen: InstancePoints) -> tuple[Tensor, Tensor]:
     """Fit rectangles from all headings and first depths; NaN where an instance has no points.
 
-    The rectangles of lowest cost are returned, in no order, and some of them may be the same.
+    Returns:
+        The C rectangles of lowest cost of each instance (M, C, 5), in no order, and some of them may be the same: x and
+        z of the centre, metres, heading `rotation_y`, radians, length and width, metres. Their mean robust costs
+        (M, C), square metres.
     """
     place, seen = _starts(seen), InstancePoints(*(each[:, None] for each in seen))
-    first = _improved(place, seen)
-    _, kept = first.cost.nan_to_num(nan=math.inf).topk(_NUM_KEPT, dim=1, largest=False)
-    return _improved(first.place.gather(1, kept[..., None].expand(-1, -1, place.shape[-1])), seen)
+    place, cost = _improved(place, seen)
+    _, kept = cost.nan_to_num(nan=math.inf).topk(_NUM_KEPT, dim=1, largest=False)
+    return _improved(place.gather(1, kept[..., None].expand(-1, -1, place.shape[-1])), seen)
 
 
 def distance_outside(place: Tensor, xz: Tensor) -> Tensor:
@@ -74,8 +70,8 @@ def outline_of(place: Tensor) -> Tensor:
     return _outer_corners(place)[0]
 
 
-def _improved(place: Tensor, seen: InstancePoints) -> Rectangles:
-    """The rectangles after some steps from places (M, C, 5)."""
+def _improved(place: Tensor, seen: InstancePoints) -> tuple[Tensor, Tensor]:
+    """The rectangles after some steps from places (M, C, 5), and their costs (M, C)."""
     limit = place.new_tensor(_LARGEST_STEP)
     damping = _DAMPING * torch.eye(len(limit), dtype=place.dtype, device=place.device)
     for _ in range(_NUM_ITERATIONS):
@@ -83,7 +79,7 @@ def _improved(place: Tensor, seen: InstancePoints) -> Rectangles:
         weighted = J * weight[..., None]
         step = -torch.linalg.solve_ex(weighted.mT @ J + damping, weighted.mT @ residual[..., None])[0][..., 0]
         place = place + step.maximum(-limit).minimum(limit)
-    return Rectangles(place, _rows(place, seen)[3])
+    return place, _rows(place, seen)[3]
 
 
 def _starts(seen: InstancePoints) -> Tensor:

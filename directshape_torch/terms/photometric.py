@@ -186,10 +186,10 @@ class Photometric(Term[Surface]):
             assert self.cars.inverse_depth_of_pixel is not None
             J_depth_offset = -depth * depth * self.cars.inverse_depth_of_pixel[owner]
             J_depth_state = torch.cat([J_depth_state / (ratio * ratio)[..., None], J_depth_offset[..., None]], dim=-1)
-        compare = compared(rows, depth)
-        usable = found & compare.comparable
-        residual = torch.where(usable[..., None], compare.residual, self.config.lost_grey_levels)
-        J = torch.where(usable[..., None], compare.J_residual_depth, 0.0)
+        residual, J, comparable = compared(rows, depth)
+        usable = found & comparable
+        residual = torch.where(usable[..., None], residual, self.config.lost_grey_levels)
+        J = torch.where(usable[..., None], J, 0.0)
         return Linear(residual, J, J_depth_state, surface.seen(anchor, depth, usable))
 
     def native_part(self, field: Field, state: State, anchor: Surface, fisher: bool) -> Part[Surface] | None:

@@ -63,14 +63,6 @@ class RightView(NamedTuple):
     covering: Annotated[Tensor, Dense("A", 2)]  # the foremost instances of the `OcclusionMap`
 
 
-class Comparison(NamedTuple):
-    """A `Comparison` holds right minus left grey levels of neighbours, and derivatives by depth of their pixel."""
-
-    residual: Tensor  # (M, 64, N)
-    J_residual_depth: Tensor  # (M, 64, N)
-    comparable: Tensor  # (M, 64) bool: every neighbour lands in the right image, where the pixel is visible
-
-
 @dataclass(frozen=True)
 class LeftPixels(Table):
     """`LeftPixels` holds all packed pixels of the left image and both images; pixel sets are made from it."""
@@ -176,14 +168,17 @@ def frame_view(images: GreyPair, frame: Tensor) -> tuple[Tensor, Tensor, Tensor,
     return first, step, last_u, last_v
 
 
-def compared(rows: PhotometricRows, depth: Tensor) -> Comparison:
-    """Residuals at depths (M, 64) with their derivatives; all neighbours are warped with the depth of their pixel."""
+def compared(rows: PhotometricRows, depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Residuals (M, 64, N) at depths (M, 64), derivatives by the depth, and a mask (M, 64) of comparable pixels.
+
+    All neighbours are warped with the depth of their pixel.
+    """
     warped = warped_pixels(rows, depth)
     along, at = rows.along_ray, warped.at
     d_u = torch.addcmul(along[0], warped.u, along[2], value=-1) * warped.inverse_z
     d_v = torch.addcmul(along[1], warped.v, along[2], value=-1) * warped.inverse_z
     J = (at.d_u * d_u + at.d_v * d_v).movedim(-3, -1)
-    return Comparison(warped.residual(rows), J, warped.is_comparable(rows.right))
+    return warped.residual(rows), J, warped.is_comparable(rows.right)
 
 
 def residuals_at(rows: PhotometricRows, depth: Tensor) -> tuple[Tensor, Tensor]:

@@ -27,7 +27,6 @@ from directshape_torch.solver.sharing import Groups
 from directshape_torch.state.cars import CarBatch, CarState
 from directshape_torch.state.unknowns import CODE
 from directshape_torch.status import Status, is_refined
-from directshape_torch.terms.photometric import PhotometricEvidence
 from directshape_torch.terms.term import Evidence
 from directshape_torch.tracks.next_view import NEXT_VIEW_NAME, NextView, NextViewEvidence, NextViews
 from directshape_torch.tracks.path import MOTION_NAMES, hold_of_path, motion_terms, timed, with_path
@@ -176,7 +175,7 @@ class Views:
         minimum = in_track.minimum
         nothing = torch.zeros(len(self.chosen.keep), dtype=minimum.after.cost.dtype, device=self.chosen.keep.device)
         term = cast("NextView | None", stage_of(minimum).term(NEXT_VIEW_NAME))
-        stereo = _photometric(self.problem)
+        stereo = self.problem.photometric
         if term is None or stereo is None:
             return nothing
         unlike = unlikeness(term, is_cut_off(stereo), minimum.prepared_end, self.next_view)
@@ -196,11 +195,7 @@ def _linked(problem: CarProblem, sharing: Groups, views: CarBatch, alone: CarSta
 
 
 def _has_next_view(problem: CarProblem) -> bool:
-    return problem.config.tracks.next_view_weight > 0 and _photometric(problem) is not None
-
-
-def _photometric(problem: CarProblem) -> PhotometricEvidence | None:
-    return cast("PhotometricEvidence | None", problem.evidence_of("photometric"))
+    return problem.config.tracks.next_view_weight > 0 and problem.photometric is not None
 
 
 def stage_of_tracks(stages: Sequence[StageConfig]) -> StageConfig:
@@ -227,7 +222,7 @@ def in_tracks(
         # A track has one acceleration, so its prior is divided among all views.
         hold = hold_of_path(config.tracks, sharing, views, alone, trusted)
         columns = [hold, 1 / sharing.total(one, sharing.all_members)]
-    stereo = _photometric(problem)
+    stereo = problem.photometric
     if stereo is not None and _has_next_view(problem):
         added.append(NextViewEvidence(config.tracks.next_view_weight, stereo, NextViews.of(views, next_view)))
         columns.append(one)

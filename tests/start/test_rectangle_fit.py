@@ -37,9 +37,9 @@ def seen_sides(cars: Tensor) -> InstancePoints:
 
 
 def best(seen: InstancePoints) -> tuple[Tensor, Tensor]:
-    found = fit_rectangles(seen)
-    cost, chosen = found.cost.min(dim=1)
-    return found.place.gather(1, chosen[:, None, None].expand(-1, 1, 5))[:, 0], cost
+    places, costs = fit_rectangles(seen)
+    cost, chosen = costs.min(dim=1)
+    return places.gather(1, chosen[:, None, None].expand(-1, 1, 5))[:, 0], cost
 
 
 def test_finds_rectangles_again() -> None:
@@ -86,7 +86,7 @@ def test_stray_points_hardly_matter() -> None:
 def test_nothing_seen_is_nan() -> None:
     seen = seen_sides(CARS)
     nothing = seen._replace(weight=seen.weight * torch.nan, middle=seen.middle * torch.nan)
-    assert fit_rectangles(nothing).place.isnan().all()
+    assert fit_rectangles(nothing)[0].isnan().all()
 
 
 @pytest.mark.parametrize("rows", [rectangle_fit._point_rows, rectangle_fit._outline_rows])

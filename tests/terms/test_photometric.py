@@ -42,22 +42,22 @@ def test_residuals_at_any_depth_are_the_references_and_have_its_slope(regime: st
     term = photometric_of(stage)
     rows, level = term.pixel_set.rows, stage.config.image_level
     depth = term.cars.input_depth[rows.rays.owner][:, None] * (1 + 0.1 * torch.rand_like(rows.pixel_weight))
-    at = compared(rows, depth)
+    residual, J, comparable = compared(rows, depth)
     expected, landed, in_front = reference.photometric(term, left_of(stage), level, depth)
     size = left_of(stage).pyramid[level].sizes[0]
     inside = ((landed >= 0) & (landed <= size.flip(0) - 1)).all(-1) & (in_front > 0)
-    counted = at.comparable & (rows.pixel_weight > 0)
+    counted = comparable & (rows.pixel_weight > 0)
     assert counted.double().mean() > 0.3
     assert inside.all(-1)[counted].all()
-    torch.testing.assert_close(at.residual[counted], expected[counted], rtol=1e-9, atol=1e-8)
+    torch.testing.assert_close(residual[counted], expected[counted], rtol=1e-9, atol=1e-8)
     step = 1e-6 * depth.mean()
     ends = [reference.photometric(term, left_of(stage), level, depth + sign * step)[0] for sign in (1, -1)]
-    error = ((ends[0] - ends[1]) / (2 * step) - at.J_residual_depth)[counted].abs()
+    error = ((ends[0] - ends[1]) / (2 * step) - J)[counted].abs()
     # A step that crosses into the next pixel sees another slope.
-    assert (error < 1e-4 * at.J_residual_depth.abs().max()).double().mean() > 0.995
-    several, comparable = residuals_at(rows, torch.stack([depth, 1.2 * depth]))
-    torch.testing.assert_close(several[0], at.residual)
-    assert torch.equal(comparable[0], at.comparable)
+    assert (error < 1e-4 * J.abs().max()).double().mean() > 0.995
+    several, comparable_there = residuals_at(rows, torch.stack([depth, 1.2 * depth]))
+    torch.testing.assert_close(several[0], residual)
+    assert torch.equal(comparable_there[0], comparable)
 
 
 def test_grazing_rays_are_those_below_the_cosine() -> None:
