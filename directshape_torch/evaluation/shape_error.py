@@ -20,9 +20,11 @@ from directshape_torch.io.image_files import read_disparity, read_single_channel
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.mask_matching import match_masks
-from directshape_torch.refinement.ray_cast import cast
+from directshape_torch.numerics.full_precision import full_precision
+from directshape_torch.rows import Rays
+from directshape_torch.shape.field import field_of
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.state.cars import CarState
+from directshape_torch.terms.depth import closest_of_march, first_hits, march
 
 Points = NDArray[np.float64]
 
@@ -119,6 +121,8 @@ class EstimatedCar:
     code: Tensor  # (K,) standard deviations
     T_cam_obj: Tensor  # (4, 4)
 
+    @torch.no_grad()
+    @full_precision()
     def points_at_pixels(
         self,
         uv_left: NDArray[np.float64],  # (P, 2)
@@ -126,8 +130,14 @@ class EstimatedCar:
     ) -> Points:  # (P, 3)
         """First intersections of rays of left pixels with the surface, left camera frame, metres; NaN for misses."""
         like, rays_cam = self.prior.origin, rays_from_pixels(torch.from_numpy(uv_left), K_left.double())
-        state = CarState.of(se3.inverse(self.T_cam_obj.double())[None].to(like), self.code[None].to(like))
-        depth = cast(self.prior, state, torch.zeros_like(like), rays_cam.to(like), _SAMPLES_PER_RAY).depth
+        field, bounds = field_of(self.prior.bind(self.code[None].to(like))), self.prior.bounds_obj
+        # Each ray is a block of its own.
+        owner = torch.zeros(len(rays_cam), dtype=torch.long, device=like.device)
+        rays_of_blocks = Rays(owner, torch.zeros_like(rays_cam).to(like), rays_cam.to(like).mT[..., None])
+        rays = rays_of_blocks.in_objects(se3.inverse(self.T_cam_obj.double())[None].to(like))
+        marched = march(field, owner, rays, bounds, _SAMPLES_PER_RAY)
+        hits = first_hits(field, owner, rays, marched, closest_of_march(field, owner, rays, bounds, marched))
+        depth = torch.where(hits.found, hits.depth, torch.nan)[:, 0]
         return np.asarray(depth.double().cpu()[:, None] * rays_cam)
 
 

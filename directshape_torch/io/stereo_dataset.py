@@ -18,7 +18,7 @@ from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.ground_plane import GroundPlane
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_choice import chosen_frames
-from directshape_torch.io.frame_detections import build_detections
+from directshape_torch.io.frame_detections import STARTED_CLASS, build_detections, detections_of_masks
 from directshape_torch.io.frame_layout import FrameFiles, FrameLayout, existing_folder
 from directshape_torch.io.image_files import read_disparity, read_pair
 from directshape_torch.io.instance_masks import MaskSource
@@ -34,7 +34,6 @@ from directshape_torch.io.layouts import (
 )
 from directshape_torch.io.mask_files import LayoutMasks
 from directshape_torch.io.mask_matching import with_image_boxes
-from directshape_torch.io.mask_starts import STARTED_CLASS, detections_of_masks
 from directshape_torch.io.track_association import associate
 from directshape_torch.io.velodyne import in_image, read_scan
 from directshape_torch.scene.detections import Detections

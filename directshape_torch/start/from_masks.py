@@ -13,6 +13,7 @@ from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.scene.masks import MaskCrops
+from directshape_torch.start.mask_border import ends_seen
 from directshape_torch.start.mask_points import (
     MaskPoints,
     depth_noise,
@@ -21,7 +22,6 @@ from directshape_torch.start.mask_points import (
     rows_of_height,
 )
 from directshape_torch.start.rectangle_fit import MEAN_HWL, InstancePoints, distance_outside, fit_rectangles, outline_of
-from directshape_torch.start.seen_ends import ends_seen
 from directshape_torch.stereo_matching.disparity import with_disparity
 
 # A mask with fewer known disparities, or with a smaller share of them, shows no car.

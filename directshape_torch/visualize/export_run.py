@@ -1,18 +1,41 @@
-"""`export_run` writes a finished run in the formats of other programs."""
+"""`export_run` writes a finished run in the formats of other programs; KITTI's boxes as text and JSON are made here."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 from directshape_torch.errors import InputError
-from directshape_torch.files.atomic_files import check_folder
+from directshape_torch.files.atomic_files import check_folder, write_bytes, write_json
+from directshape_torch.files.read_files import read_bytes
+from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.run_folder import FrameResult, result_path
 from directshape_torch.visualize.frame_source import Exporter, ExportOptions, FrameSource
-from directshape_torch.visualize.kitti_files import KittiExporter
 from directshape_torch.visualize.rerun_recording import RerunExporter
 from directshape_torch.visualize.run_frames import RunInputs
 from directshape_torch.visualize.surface_files import GlbExporter, PlyExporter, PointsExporter
+
+_KITTI_FRAME = "ref: KITTI's rectified camera 0, x right, y down, z forward, metres and radians"
+
+
+class KittiExporter(Exporter):
+    """A `KittiExporter` copies `kitti/data/NNNNNN.txt` unchanged and writes its lines as `kitti/json/NNNNNN.json`."""
+
+    def add(self, source: FrameSource) -> None:
+        frame, frame_id, folder = source.result, source.frame_id, self.folder / "kitti"
+        write_bytes(folder / "data" / f"{frame_id}.txt", read_bytes(result_path(self.inputs.run.path, frame_id)))
+        content = {
+            "schema": "directshape kitti results",
+            "schema_version": 1,
+            "frame_id": frame_id,
+            "coordinates": _KITTI_FRAME,
+            "objects": [{**_columns(line), **_refinement(frame, line)} for line in frame.lines],
+        }
+        write_json(folder / "json" / f"{frame_id}.json", content)
+
 
 FORMATS: dict[str, type[Exporter]] = {
     "glb": GlbExporter,
@@ -67,3 +90,42 @@ def export_run(
         for exporter in exporters:
             exporter.finish()
         stack.pop_all()
+
+
+def _columns(line: KittiObject) -> dict[str, Any]:
+    return {
+        "line": line.line_number,
+        "type": line.type,
+        "truncated": line.truncated,
+        "occluded": line.occluded,
+        "alpha": line.alpha,
+        "bbox": list(line.box_2d),
+        "dimensions_hwl": list(line.hwl),
+        "location": list(line.location_ref),
+        "rotation_y": line.rotation_y,
+        "score": line.score,
+    }
+
+
+def _refinement(frame: FrameResult, line: KittiObject) -> dict[str, Any]:
+    shapes = frame.shapes
+    car = next((car for car, number in enumerate(shapes.input_lines) if number == line.line_number), None)
+    if car is None:
+        return {"status": "copied"}
+    known = {
+        "sigma_xyz_yaw": shapes.sigmas_ref[car],
+        "probability_better": shapes.probabilities_better[car],
+        "probability_not_worse": shapes.probabilities_not_worse[car],
+        "probability_heading": shapes.probabilities_heading[car],
+        "mask_iou_left": shapes.mask_iou_left[car],
+        "mask_iou_right": shapes.mask_iou_right[car],
+        "code": shapes.codes[car],
+    }
+    return {"status": shapes.statuses[car], **{name: _numbers(value.tolist()) for name, value in known.items()}}
+
+
+def _numbers(values: float | list[float]) -> Any:
+    """The values with None for NaN and infinity, which JSON does not have."""
+    if isinstance(values, list):
+        return [_numbers(value) for value in values]
+    return values if math.isfinite(values) else None

@@ -1,11 +1,22 @@
-"""The disparities across the border of a mask tell whether what it shows ends there."""
+"""The disparities across the border of a mask tell whether what it shows ends there.
+
+An end of a car is seen where neither the border of the image nor a nearer object cuts its mask off.
+"""
 
 from __future__ import annotations
 
-import torch
+from dataclasses import replace
 
-from directshape_torch.scene.masks import MaskCrops
-from directshape_torch.start.mask_border import share_going_on
+import pytest
+import torch
+from torch import Tensor
+
+from directshape_torch import FrameBatch, MaskCrops, StereoCamera
+from directshape_torch.start.mask_border import ends_seen, share_going_on
+from directshape_torch.start.mask_points import points_under
+
+FOCAL_PX, BASELINE_M, HEIGHT, WIDTH, HORIZON_V = 700.0, 0.5, 200, 600, 80
+CAR_ROWS = (72, 165)
 
 
 def masks() -> MaskCrops:
@@ -49,3 +60,70 @@ def test_masks_with_gradients_and_padded_frames_have_the_shares_of_others() -> N
     wall = torch.full((1, 90, 130), 12.0)
     padded = torch.nn.functional.pad(wall, (0, 30))
     assert share_going_on(padded, car, frame_index).item() == 1.0
+
+
+def scene(car_m: float, columns: tuple[int, int] = (250, 350)) -> tuple[FrameBatch, MaskCrops]:
+    """A flat car at a depth, in front of a far wall."""
+    K = [[FOCAL_PX, 0, WIDTH / 2], [0, FOCAL_PX, HORIZON_V], [0, 0, 1]]
+    black = torch.zeros(1, 3, HEIGHT, WIDTH)
+    frames = FrameBatch.from_images(black, black, StereoCamera.from_intrinsics(K, BASELINE_M), ground=1.65)
+    mask = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool)
+    mask[:, CAR_ROWS[0] : CAR_ROWS[1], columns[0] : columns[1]] = True
+    disparity = torch.full((1, HEIGHT, WIDTH), FOCAL_PX * BASELINE_M / 60)
+    disparity[mask] = FOCAL_PX * BASELINE_M / car_m
+    return replace(frames, disparity=disparity), MaskCrops.of(mask)
+
+
+def seen(frames: FrameBatch, masks: MaskCrops) -> list[bool]:
+    frame_index = torch.zeros(len(masks), dtype=torch.int64)
+    found: Tensor = ends_seen(frames, masks, frame_index, points_under(frames, masks, frame_index).points_cam)
+    return found.flatten().tolist()
+
+
+def with_object(frames: FrameBatch, depth_m: float, columns: slice, rows: slice = slice(*CAR_ROWS)) -> FrameBatch:
+    assert frames.disparity is not None
+    disparity = frames.disparity.clone()
+    disparity[0, rows, columns] = FOCAL_PX * BASELINE_M / depth_m
+    return replace(frames, disparity=disparity)
+
+
+def test_both_ends_of_a_car_by_itself_are_seen() -> None:
+    assert seen(*scene(12.0)) == [True, True]
+
+
+@pytest.mark.parametrize(("columns", "expected"), [((0, 100), [False, True]), ((520, 600), [True, False])])
+def test_the_border_of_the_image_cuts_off(columns: tuple[int, int], expected: list[bool]) -> None:
+    assert seen(*scene(12.0, columns)) == expected
+
+
+def test_what_is_nearer_hides_the_end_beside_it() -> None:
+    frames, masks = scene(12.0)
+    assert seen(with_object(frames, 9.0, slice(200, 250)), masks) == [False, True]
+    assert seen(with_object(frames, 9.0, slice(350, 365)), masks) == [True, False]
+
+
+def test_what_is_beside_or_behind_the_car_hides_nothing() -> None:
+    frames, masks = scene(12.0)
+    assert seen(with_object(frames, 12.1, slice(200, 250)), masks) == [True, True]
+    assert seen(with_object(frames, 20.0, slice(200, 250)), masks) == [True, True]
+
+
+def test_the_road_hides_nothing() -> None:
+    frames, masks = scene(12.0)
+    # At 9 m the road is seen in row 80 + 700 * 1.65 / 9 = 208, so that these rows are at most 0.3 m above it.
+    assert seen(with_object(frames, 9.0, slice(200, 250), slice(185, 200)), masks) == [True, True]
+
+
+def test_what_touches_the_lower_part_alone_hides_too() -> None:
+    frames, masks = scene(12.0)
+    assert seen(with_object(frames, 9.0, slice(200, 250), slice(125, 165)), masks) == [False, True]
+
+
+def test_columns_of_far_cars_count_all_the_same() -> None:
+    frames, masks = scene(40.0)
+    assert seen(with_object(frames, 9.0, slice(200, 250)), masks) == [True, True]
+
+
+def test_no_masks_have_no_ends() -> None:
+    frames, masks = scene(12.0)
+    assert seen(frames, masks.rows(torch.zeros(0, dtype=torch.int64))) == []

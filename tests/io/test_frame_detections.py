@@ -13,8 +13,8 @@ from helpers.layouts import write_odometry, write_raw, write_sequence
 
 import directshape_torch
 from directshape_torch.errors import InputError
+from directshape_torch.io.frame_detections import detections_of_masks
 from directshape_torch.io.instance_masks import InstanceMask
-from directshape_torch.io.mask_starts import detections_of_masks
 from directshape_torch.io.stereo_dataset import LayoutName, LoadedFrame, open_dataset
 
 DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
