@@ -147,10 +147,10 @@ class DirectShapeRefiner(nn.Module):
             full_precision(),
             compiling(self.config.compile),
         ):
-            result, started = self._refine(frames, detections, term_weights=term_weights, detector_noise=noise)
-            result = result if noise is None else fused(result, started)
+            result, cars = self._refine(frames, detections, term_weights=term_weights, detector_noise=noise)
+            result = result if noise is None else fused(result, cars)
             again = partial(self._refine, frames, term_weights=term_weights)
-            return searched(self.config, frames, detections, noise, result, again)
+            return searched(self.config, frames, detections, cars, result, again)
 
     @property
     def weighs_detector(self) -> bool:
@@ -213,22 +213,22 @@ class DirectShapeRefiner(nn.Module):
         *,
         term_weights: Mapping[str, Tensor] | None,
         detector_noise: Tensor | None = None,
-    ) -> tuple[RefinementResult, Detections]:
-        """The result of the chosen cars (B,), by default all, and the detections with the poses that it began with."""
+    ) -> tuple[RefinementResult, CarBatch]:
+        """The result of the chosen cars (B,), by default all, and all cars with the poses that it began with."""
         if detections.track_id is not None and detections.other_T_cam_obj is not None:
             return self._refine_facing_one_way(frames, detections, term_weights, detector_noise)
         seen = self._observe(frames, detections)
-        cars = replace(self._cars(frames, detections), detector_noise=detector_noise)
-        failure = refusals(cars, seen, self.config)
+        everyone = replace(self._cars(frames, detections), detector_noise=detector_noise)
+        failure = refusals(everyone, seen, self.config)
         usable = Chosen.where(failure < 0 if chosen is None else (failure < 0) & chosen)
-        rows, cars = usable.index, cars.of(usable)
+        rows, cars = usable.index, everyone.of(usable)
         problem = problem_of_scene(
             self.config, self.prior, frames, detections, cars, seen.of(usable), self.extra_terms, term_weights
         )
         unrefined = unrefined_result(self.prior, frames, detections, failure, problem.term_names)
         if not len(rows):
-            return unrefined, detections
-        initial = self._input_state(detections.T_cam_obj.index_select(0, rows), cars)
+            return unrefined, everyone
+        initial = self._input_state(cars)
         is_all, others = len(rows) == len(unrefined), detections.other_T_cam_obj
         beforehand = unrefined if is_all else unrefined.rows(rows)
         if others is None:
@@ -239,9 +239,10 @@ class DirectShapeRefiner(nn.Module):
 
             own = others.index_select(0, rows)
             found, T_cam_obj = refined_from_candidates(problem, cars, initial, own, beforehand)
-            detections = replace(detections, T_cam_obj=detections.T_cam_obj.index_copy(0, rows, T_cam_obj))
+            T_cam_obj = everyone.detector_T_cam_obj.index_copy(0, rows, T_cam_obj)
+            everyone = replace(everyone, detector_T_cam_obj=T_cam_obj)
         result = found if is_all else replace(unrefined.put(rows, found), term_names=found.term_names)
-        return result, detections
+        return result, everyone
 
     def _refine_facing_one_way(
         self,
@@ -249,7 +250,7 @@ class DirectShapeRefiner(nn.Module):
         detections: Detections,
         term_weights: Mapping[str, Tensor] | None,
         detector_noise: Tensor | None,
-    ) -> tuple[RefinementResult, Detections]:
+    ) -> tuple[RefinementResult, CarBatch]:
         """Refine cars that have tracks and several poses: each is first refined alone to choose its pose."""
         # The import stands here, because only such cars need it.
         from directshape_torch.start.driving_direction import facing_one_way
@@ -258,13 +259,13 @@ class DirectShapeRefiner(nn.Module):
         has_others = detections.other_T_cam_obj.isfinite().flatten(1).any(dim=1)
         with torch.no_grad():
             by_itself = replace(detections, track_id=None)
-            alone, started = self._refine(frames, by_itself, term_weights=term_weights, detector_noise=detector_noise)
-            of_front = alone.quality.probability_heading
-        started = replace(started, track_id=detections.track_id, other_T_cam_obj=None)
-        started, of_front = facing_one_way(frames, started, has_others, of_front)
-        result, started = self._refine(frames, started, term_weights=term_weights, detector_noise=detector_noise)
+            alone, cars = self._refine(frames, by_itself, term_weights=term_weights, detector_noise=detector_noise)
+        cars = replace(cars, track_id=detections.track_id)
+        T_cam_obj, of_front = facing_one_way(cars, has_others, alone.quality.probability_heading)
+        started = replace(detections, T_cam_obj=T_cam_obj, other_T_cam_obj=None)
+        result, cars = self._refine(frames, started, term_weights=term_weights, detector_noise=detector_noise)
         of_front = torch.where(result.refined, of_front, torch.nan)
-        return replace(result, quality=replace(result.quality, probability_heading=of_front)), started
+        return replace(result, quality=replace(result.quality, probability_heading=of_front)), cars
 
     @full_precision()
     def problem(
@@ -277,7 +278,7 @@ class DirectShapeRefiner(nn.Module):
         problem = problem_of_scene(
             self.config, self.prior, frames, detections, cars, seen, self.extra_terms, term_weights
         )
-        return problem, self._input_state(detections.T_cam_obj, cars)
+        return problem, self._input_state(cars)
 
     def _with_rig(self, frames: FrameBatch, detections: Detections) -> tuple[FrameBatch, Detections]:
         """The inputs of a call with what is known of the rig and the detector."""
@@ -297,9 +298,9 @@ class DirectShapeRefiner(nn.Module):
         sigma_px = self.config.rig.disparity_sigma_px if self._is_rig_unknown(frames) else 0.0
         return CarBatch.from_scene(frames, detections, sigma_px)
 
-    def _input_state(self, T_cam_obj: Tensor, cars: CarBatch) -> CarState:
-        code = self.prior.initial_code(len(T_cam_obj)).to(T_cam_obj)
-        return CarState.of(se3.inverse(T_cam_obj), code, cars.num_offsets)
+    def _input_state(self, cars: CarBatch) -> CarState:
+        code = self.prior.initial_code(len(cars)).to(cars.detector_T_cam_obj)
+        return CarState.of(se3.inverse(cars.detector_T_cam_obj), code, cars.num_offsets)
 
     def _observe(self, frames: FrameBatch, detections: Detections) -> Observation:
         """What the images show of all cars, with points of stereo where the settings fit them."""

@@ -26,7 +26,6 @@ from directshape_torch.state.unknowns import CODE, POSE, Unknowns
 
 if TYPE_CHECKING:
     from directshape_torch.refinement.result import RefinementResult
-    from directshape_torch.scene.detections import Detections
 
 UNKNOWN_DETECTOR = torch.tensor([0.0260, 0.1558, 0.0779, 0.2078, 0.70, 0.16, 0.16], dtype=torch.float64)
 """These are the standard deviations of a detector of which nothing is known.
@@ -134,8 +133,8 @@ def chances(result: RefinementResult, comparison: DetectorComparison, brings_tog
     return probabilities(returned, comparison.difference - moved, comparison.covariance, hwl, turned)
 
 
-def fused(result: RefinementResult, detections: Detections) -> RefinementResult:
-    """The result with the images' boxes moved to the most probable boxes between them and the detections.
+def fused(result: RefinementResult, cars: CarBatch) -> RefinementResult:
+    """The result with the images' boxes moved to the most probable boxes between them and the detector's boxes.
 
     Views of a track keep the images' boxes, because the views already support one another.
     """
@@ -144,7 +143,7 @@ def fused(result: RefinementResult, detections: Detections) -> RefinementResult:
     rows = (result.refined & known & (result.track_part < 0)).nonzero()[:, 0]
     if not len(rows):
         return result
-    own, boxes, gain = result.rows(rows), (detections.T_cam_obj[rows], detections.dimensions_hwl[rows]), gains[rows]
+    own, boxes, gain = result.rows(rows), (cars.detector_T_cam_obj[rows], cars.detector_hwl[rows]), gains[rows]
     difference = _difference(own, *boxes)
     with torch.no_grad():
         J = quantities_jacobian(own.prior, _state(own))

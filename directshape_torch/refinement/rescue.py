@@ -57,9 +57,9 @@ def searched(
     config: RefinerConfig,
     frames: FrameBatch,
     detections: Detections,
-    detector_noise: Tensor | None,
+    cars: CarBatch,
     result: RefinementResult,
-    refine: Callable[[Detections, Tensor], tuple[RefinementResult, Detections]],
+    refine: Callable[[Detections, Tensor], tuple[RefinementResult, CarBatch]],
 ) -> RefinementResult:
     """The result with cars that were found from their masks, as the setting `search` asks.
 
@@ -69,7 +69,7 @@ def searched(
         config: settings of the refiner.
         frames: frames of the call, with what is known of the rig.
         detections: detections of the call.
-        detector_noise: (B, 7) standard deviations of the boxes, or None, see `CarBatch`.
+        cars: the cars of the detections.
         result: what came of the given boxes.
         refine: refines some cars (B,) of other detections.
     """
@@ -90,9 +90,9 @@ def searched(
         return result
     again, _ = refine(made, lost)
     found = Chosen.where(lost & again.refined)
-    given = replace(CarBatch.from_scene(frames, detections), detector_noise=detector_noise).of(found)
+    given = replace(cars, detector_T_cam_obj=detections.T_cam_obj).of(found)
     before = result.rows(found.index)
-    later = fused(_explained(again.rows(found.index), given, before), detections.rows(found.index))
+    later = fused(_explained(again.rows(found.index), given, before), given)
     kept = _is_better(later, before, config.acceptance).nonzero()[:, 0]
     return going_on(result, found.index[kept], later.rows(kept)) if len(kept) else result
 

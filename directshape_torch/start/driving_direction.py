@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from directshape_torch.scene.detections import Detections
-from directshape_torch.scene.frames import FrameBatch
+from directshape_torch.state.cars import CarBatch
 
 # Start boxes are off by this share of their distance along the viewing ray, and by this length in any direction.
 _SIGMA_SHARE, _SIGMA_M = 0.03, 0.2
@@ -18,11 +16,10 @@ _BACKWARDS_SHARE, _WRONG_SHARE = 0.01, 0.05
 
 
 def facing_one_way(
-    frames: FrameBatch,
-    detections: Detections,  # B cars with tracks, each with its best start
+    cars: CarBatch,  # B cars with tracks, each with its best start
     is_questioned: Tensor,  # (B,) bool, cars whose front is not given
     probability: Tensor,  # (B,)
-) -> tuple[Detections, Tensor]:
+) -> tuple[Tensor, Tensor]:
     """Turn start boxes so that all views of a track have the front at one end of their car.
 
     A car turns by less than a right angle from one view to the next, so the sense of one view gives that of all. The
@@ -30,45 +27,41 @@ def facing_one_way(
     driven along its headings where poses of the camera are known. Views with a given front have a say, too.
 
     Args:
-        frames: the frames of the call.
-        detections: the cars; those in no track keep their boxes.
+        cars: the cars; those in no track keep their boxes.
         is_questioned: cars whose front is not given.
         probability: probability that the front is where the box has it, NaN where nothing is known.
 
     Returns:
-        The detections, and the probability (B,) for the turned boxes.
+        The start poses (B, 4, 4), and the probability (B,) for the turned boxes.
     """
-    assert detections.track_id is not None, "the cars have no tracks"
-    T_cam_obj = detections.T_cam_obj.detach()
-    in_track = (detections.track_id >= 0) & T_cam_obj.isfinite().flatten(1).all(dim=1)
-    has_poses, eye = frames.T_world_cam is not None, torch.eye(4).to(T_cam_obj)[None]
-    T_frame_cam = eye.expand(len(frames), 4, 4) if frames.T_world_cam is None else frames.T_world_cam
-    T = T_frame_cam[detections.frame_index] @ T_cam_obj
+    T_cam_obj = cars.detector_T_cam_obj.detach()
+    T = T_cam_obj if cars.T_world_cam is None else cars.T_world_cam @ T_cam_obj
     says = torch.logit(torch.where(is_questioned, probability, 1 - _WRONG_SHARE)).nan_to_num(nan=0.0)
     sense, probability = torch.ones_like(T_cam_obj[:, 0, 0]), probability.clone()
-    for rows in _tracks(frames, detections, in_track):
+    for rows in _tracks(cars):
         if not bool(is_questioned[rows].any()):
             continue
         of_track = _sense_of_track(T[rows])
         log_odds = (of_track.to(says) * says[rows]).mean()
-        if not has_poses and bool((probability[rows].isnan() & is_questioned[rows]).all()):
-            log_odds = log_odds + torch.nan
-        if has_poses:
+        if cars.T_world_cam is not None:
             log_odds = log_odds + _log_odds_of_way(T[rows], T_cam_obj[rows], of_track).to(says)
+        elif bool((probability[rows].isnan() & is_questioned[rows]).all()):
+            log_odds = log_odds + torch.nan
         sense[rows] = torch.where(log_odds < 0, -of_track, of_track)
         probability[rows] = torch.sigmoid(log_odds.abs())
     # The front of a given box stays where it is.
     sense, probability = sense.masked_fill(~is_questioned, 1.0), probability.masked_fill(~is_questioned, torch.nan)
     turn = torch.stack([sense, torch.ones_like(sense), sense, torch.ones_like(sense)], dim=1)
-    return replace(detections, T_cam_obj=detections.T_cam_obj * turn[:, None]), probability
+    return cars.detector_T_cam_obj * turn[:, None], probability
 
 
-def _tracks(frames: FrameBatch, detections: Detections, in_track: Tensor) -> list[list[int]]:
-    """The rows of each track, in the order of time."""
-    assert detections.track_id is not None
-    times = detections.frame_index if frames.time_s is None else frames.time_s[detections.frame_index]
+def _tracks(cars: CarBatch) -> list[list[int]]:
+    """The rows of each track with a finite pose, in the order of time."""
+    assert cars.track_id is not None, "the cars have no tracks"
+    in_track = (cars.track_id >= 0) & cars.detector_T_cam_obj.isfinite().flatten(1).all(dim=1)
+    times = cars.frame_index if cars.time_s is None else cars.time_s
     views: defaultdict[int, list[tuple[float, int]]] = defaultdict(list)
-    values = zip(detections.track_id.tolist(), times.tolist(), in_track.tolist(), strict=True)
+    values = zip(cars.track_id.tolist(), times.tolist(), in_track.tolist(), strict=True)
     for row, (track, time, is_view) in enumerate(values):
         if is_view:
             views[track].append((time, row))

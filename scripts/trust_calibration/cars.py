@@ -104,7 +104,7 @@ def _evidence(frame: Frame, comparison: DetectorComparison) -> Array:
 def _judged(frame: Frame, cars: CarBatch, comparison: DetectorComparison, noise: ImageNoise) -> Judged:
     result = frame.result
     chance = torch.stack(chances(result, comparison, brings_together=True), dim=1).numpy()
-    together = fused(replace(result, comparison=comparison), frame.detections)
+    together = fused(replace(result, comparison=comparison), frame.cars)
     after, standard = np.full(len(result), np.nan), np.full((len(result), 7), np.nan)
     if frame.boxes is not None:
         _, truth = frame.boxes

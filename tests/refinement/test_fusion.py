@@ -40,8 +40,8 @@ def cars_of(detections: Detections, sigmas: Tensor | None) -> CarBatch:
 
 
 def brought_together(result: RefinementResult, detections: Detections, sigmas: Tensor | None) -> RefinementResult:
-    comparison = compared(result, cars_of(detections, sigmas), NOISE)
-    return fused(replace(result, comparison=comparison), detections)
+    cars = cars_of(detections, sigmas)
+    return fused(replace(result, comparison=compared(result, cars, NOISE)), cars)
 
 
 def differences(result: RefinementResult, detections: Detections) -> Tensor:

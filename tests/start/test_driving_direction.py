@@ -12,6 +12,7 @@ from torch import Tensor
 from directshape_torch import Detections, FrameBatch, StereoCamera
 from directshape_torch.geometry.box3d import rotation_y_from_pose
 from directshape_torch.start.driving_direction import facing_one_way
+from directshape_torch.state.cars import CarBatch
 
 SPEED_M = 1.0  # from frame to frame
 
@@ -34,10 +35,6 @@ def scene(headings: Tensor, steps_m: float, has_poses: bool = True) -> tuple[Fra
     return frames, replace(detections, track_id=track_id)
 
 
-def headings_of(detections: Detections) -> Tensor:
-    return rotation_y_from_pose(detections.T_cam_obj)
-
-
 def turned(detections: Detections, rows: list[bool]) -> Detections:
     T = detections.T_cam_obj.clone()
     T[rows] = T[rows] @ torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
@@ -47,8 +44,8 @@ def turned(detections: Detections, rows: list[bool]) -> Detections:
 def faced(frames: FrameBatch, detections: Detections, says: list[float]) -> tuple[Tensor, Tensor]:
     """The headings of the cars, and the probability of their fronts."""
     is_questioned = torch.ones(len(detections), dtype=torch.bool)
-    found, probability = facing_one_way(frames, detections, is_questioned, torch.tensor(says))
-    return headings_of(found), probability
+    T_cam_obj, probability = facing_one_way(CarBatch.from_scene(frames, detections), is_questioned, torch.tensor(says))
+    return rotation_y_from_pose(T_cam_obj), probability
 
 
 @pytest.mark.parametrize("rows", [[False] * 6, [True] * 6, [True, False, False, True, True, False]])
@@ -73,7 +70,7 @@ def test_most_views_of_a_parked_car_decide(has_poses: bool) -> None:
 def test_without_poses_of_the_camera_the_way_says_nothing() -> None:
     frames, detections = scene(torch.full((3,), math.pi / 2), -SPEED_M, has_poses=False)
     headings, probability = faced(frames, detections, [0.7, 0.7, 0.7])
-    torch.testing.assert_close(headings, headings_of(detections))
+    torch.testing.assert_close(headings, rotation_y_from_pose(detections.T_cam_obj))
     torch.testing.assert_close(probability, torch.full((3,), 0.7))
 
 
@@ -82,8 +79,8 @@ def test_given_fronts_and_cars_by_themselves_stay() -> None:
     says, questioned = torch.full((3,), 0.7), torch.ones(3, dtype=torch.bool)
     alone = replace(detections, track_id=torch.full((3,), -1))
     for given, is_questioned in ((detections, ~questioned), (alone, questioned)):
-        found, probability = facing_one_way(frames, given, is_questioned, says)
-        assert torch.equal(found.T_cam_obj, detections.T_cam_obj)
+        T_cam_obj, probability = facing_one_way(CarBatch.from_scene(frames, given), is_questioned, says)
+        assert torch.equal(T_cam_obj, detections.T_cam_obj)
         torch.testing.assert_close(probability, says.where(is_questioned, torch.nan), equal_nan=True)
 
 
@@ -92,7 +89,8 @@ def test_a_view_with_a_given_front_has_a_say() -> None:
     frames, detections = scene(truth, 0.0, has_poses=False)
     is_questioned = torch.tensor([True, False, True])
     start = turned(detections, [True, False, True])
-    found, probability = facing_one_way(frames, start, is_questioned, torch.tensor([0.6, math.nan, 0.6]))
-    torch.testing.assert_close(headings_of(found), truth)
+    cars = CarBatch.from_scene(frames, start)
+    T_cam_obj, probability = facing_one_way(cars, is_questioned, torch.tensor([0.6, math.nan, 0.6]))
+    torch.testing.assert_close(rotation_y_from_pose(T_cam_obj), truth)
     assert (probability[is_questioned] > 0.6).all()
     assert probability[1].isnan()
