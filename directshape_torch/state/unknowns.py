@@ -7,7 +7,7 @@ derivatives by these blocks; all other code asks `state.unknowns` for columns.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol, TypeVar
 
@@ -91,6 +91,7 @@ class State(TensorTuple, Protocol):
 
 
 AnyState = TypeVar("AnyState", bound=State)
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -170,6 +171,21 @@ class Unknowns:
         steps = delta.to(state.code.dtype).split_with_sizes([block.size for block in self.blocks], dim=1)
         values = zip(self.blocks, state, steps, strict=True)
         return remade(state, (block.moved(value, step, max_code, max_angle) for block, value, step in values))
+
+    def derivative(self, of: Callable[[AnyState], _T], state: AnyState) -> tuple[_T, _T]:
+        """What a function makes of a state, tensors (B, ...), and its derivatives (B, ..., D) in forward mode.
+
+        Each value belongs to one car, so one tangent moves all cars at once, and D batched tangents share one
+        evaluation of the values.
+        """
+
+        def moved(delta: Tensor) -> tuple[_T, _T]:
+            values = of(self.retract(state, delta.expand(len(state.code), self.size)))
+            return values, values
+
+        zero = torch.zeros(self.size, dtype=state.code.dtype, device=state.code.device)
+        derivatives, values = torch.func.jacfwd(moved, has_aux=True)(zero)
+        return values, derivatives
 
     def largest_steps(self, device: torch.device) -> Tensor:
         """The largest trusted step (D,) of each unknown, float64; the caller must not write to this tensor."""

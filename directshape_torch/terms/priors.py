@@ -101,22 +101,11 @@ class PriorTerm(Term[NoAnchor]):
     def row_weight(self) -> Tensor:
         return torch.ones_like(self.cars.input_depth, dtype=torch.float64).expand(self.num_rows, 1, -1).movedim(-1, 0)
 
-    def _derived(self, state: State) -> PriorResidual:
-        """The residual with its Jacobian by all unknowns, from forward-mode differentiation."""
-        unknowns = state.unknowns
-
-        def residual(delta: Tensor) -> tuple[Tensor, Tensor]:
-            at = self._at(unknowns.retract(state, delta.expand(len(state.code), unknowns.size)))
-            assert isinstance(at, Tensor)
-            return at, at
-
-        zero = torch.zeros(unknowns.size, dtype=state.code.dtype, device=state.code.device)
-        J, value = torch.func.jacfwd(residual, has_aux=True)(zero)
-        return PriorResidual(value, J)
-
     def linear(self, field: Field, state: State, anchor: NoAnchor) -> Linear[NoAnchor]:
         at = self._at(state)
-        at = self._derived(state) if isinstance(at, Tensor) else at
+        if isinstance(at, Tensor):
+            residual, J = state.unknowns.derivative(lambda moved: self.residual(field, moved, anchor), state)
+            return Linear(residual, torch.ones_like(residual), J[:, :, 0], anchor)
         residual = at.residual.to(torch.float64)[..., None]
         return Linear(residual, torch.ones_like(residual), at.J_residual_state.to(torch.float64), anchor)
 

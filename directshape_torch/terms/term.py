@@ -316,18 +316,11 @@ def by_autograd(
 ) -> list[tuple[Tensor, Tensor]]:
     """Return residuals (M, R, N) of every term and their Jacobian (M, R, N, D) by forward-mode differentiation.
 
-    Each residual depends on one car only, so one tangent of `retract` moves all cars at once, and D batched tangents
-    share one evaluation of the values. Anchors are constants, as in the hand-derived form.
+    Anchors are constants, as in the hand-derived form.
     """
 
-    unknowns = state.unknowns
-
-    def residuals(delta: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-        moved = unknowns.retract(state, delta.expand(len(state.code), unknowns.size))
+    def residuals(moved: State) -> list[Tensor]:
         field = field_of(prior.bind(moved.code))
-        of_terms = [term.residual(field, moved, anchor) for term, anchor in zip(terms, anchors, strict=True)]
-        return of_terms, of_terms
+        return [term.residual(field, moved, anchor) for term, anchor in zip(terms, anchors, strict=True)]
 
-    zero = torch.zeros(unknowns.size, dtype=state.code.dtype, device=state.code.device)
-    jacobians, values = torch.func.jacfwd(residuals, has_aux=True)(zero)
-    return list(zip(values, jacobians, strict=True))
+    return list(zip(*state.unknowns.derivative(residuals, state), strict=True))
