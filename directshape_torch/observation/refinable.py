@@ -13,7 +13,7 @@ from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import FOLLOWING
 from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.observation.packing import Observation
-from directshape_torch.scene.detections import Detections, Occluders
+from directshape_torch.scene.detections import Detections, check_instances
 from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.state.cars import CarBatch
@@ -50,10 +50,10 @@ def fitting(frames: FrameBatch, detections: Detections, prior: ShapePrior, other
                 f"{tensor.dtype} on {tensor.device}",
                 "move them together with .to(device, dtype)",
             )
-    _check_masks("detections", detections, frames)
+    for of, of_kind in (("detections.", detections), ("detections.occluders.", detections.occluders)):
+        if of_kind is not None:
+            check_instances(frames, of_kind.frame_index, of_kind.mask_left, of_kind.mask_right, of)
     _check_times(detections, frames)
-    if detections.occluders is not None:
-        _check_masks("detections.occluders", detections.occluders, frames)
     of_prior = (tensor for _, tensor in (*prior.named_buffers(), *prior.named_parameters()))
     _check_no_tangents(frames, detections, (*others, *of_prior))
     return detections
@@ -94,19 +94,6 @@ def _check_no_tangents(frames: FrameBatch, detections: Detections, others: Itera
             "some with",
             "differentiate in reverse mode: .backward(), torch.func.vjp or jacrev, with backward.mode",
         )
-
-
-def _check_masks(name: str, instances: Detections | Occluders, frames: FrameBatch) -> None:
-    """Raise `InputError` unless masks have the image size and the frame numbers of the call."""
-    if not len(instances.frame_index):
-        return
-    size_hw = tuple(frames.images_left.shape[2:])
-    for side, masks in (("mask_left", instances.mask_left), ("mask_right", instances.mask_right)):
-        if masks.size_hw != size_hw:
-            raise InputError(f"{name}.{side}", f"masks of the (padded) image size {size_hw}", f"{masks.size_hw}")
-    lowest, highest = torch.stack(torch.aminmax(instances.frame_index)).tolist()
-    if lowest < 0 or highest >= len(frames):
-        raise InputError(f"{name}.frame_index", f"0..{len(frames) - 1}", f"{lowest}..{highest}")
 
 
 def _check_times(detections: Detections, frames: FrameBatch) -> None:

@@ -254,11 +254,9 @@ class Detections(TensorRecord):
         count = len(left)
         right = _crops_of("mask_right", [None] * count if mask_right is None else mask_right, size_hw, left.values)
         _check_mask_numbers(left, right, count)
-        for name, masks in (("mask_left", left), ("mask_right", right)):
-            if masks.size_hw != size_hw:
-                raise InputError(name, f"masks of the (padded) image size {size_hw}", f"{masks.size_hw}")
         index = like.new_zeros(count, dtype=torch.long) if frame_index is None else as_index(frame_index, like)
         check_shape("frame_index", index, (count,), "one for each mask", kind="index")
+        check_instances(frames, index, left, right)
         scores = like.new_ones(count) if score is None else as_floating(score, like)
         return start_boxes(frames, left, right, index, scores)
 
@@ -310,6 +308,24 @@ def _check_mask_numbers(left: MaskCrops, right: MaskCrops, count: int) -> None:
     for name, masks in (("mask_left", left), ("mask_right", right)):
         if len(masks) != count:
             raise InputError(name, f"{count} masks, one for each instance", f"{len(masks)}")
+
+
+def check_instances(
+    frames: FrameBatch, frame_index: Tensor, mask_left: MaskCrops, mask_right: MaskCrops, of: str = ""
+) -> None:
+    """Raise `InputError` unless the masks of instances have the size of the images, and their frames exist.
+
+    `of` comes before the names of masks and frame numbers in messages.
+    """
+    if not len(frame_index):
+        return
+    size_hw = tuple(frames.images_left.shape[2:])
+    for name, masks in (("mask_left", mask_left), ("mask_right", mask_right)):
+        if masks.size_hw != size_hw:
+            raise InputError(f"{of}{name}", f"masks of the (padded) image size {size_hw}", f"{masks.size_hw}")
+    lowest, highest = torch.stack(torch.aminmax(frame_index)).tolist()
+    if lowest < 0 or highest >= len(frames):
+        raise InputError(f"{of}frame_index", f"0..{len(frames) - 1}", f"{lowest}..{highest}")
 
 
 def _check_tracks(

@@ -7,7 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-from directshape_torch.errors import InputError
 from directshape_torch.geometry.box3d import pose_from_kitti, wrap_angle
 from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.scene.detections import Detections
@@ -57,7 +56,6 @@ def start_boxes(
     score: Tensor,  # (M,)
 ) -> Detections:
     """The detections of `Detections.from_masks`."""
-    _check_frame_index(frame_index, len(frames))
     frames = with_disparity(frames, frame_index, mask_left.extents)
     under = points_under(frames, mask_left, frame_index)
     end = _mirrored_rows(frames, mask_left, frame_index, under.points_cam)
@@ -86,11 +84,6 @@ def start_boxes(
         is_from_masks=torch.ones_like(is_car),
         other_T_cam_obj=T_cam_obj[:, 1:],
     )
-
-
-def _check_frame_index(frame_index: Tensor, num_frames: int) -> None:
-    if len(frame_index) and not 0 <= int(frame_index.min()) <= int(frame_index.max()) < num_frames:
-        raise InputError("frame_index", f"0..{num_frames - 1}", f"{frame_index.min()}..{frame_index.max()}")
 
 
 def _mirrored_rows(frames: FrameBatch, masks: MaskCrops, frame_index: Tensor, points_cam: Tensor) -> Tensor:
