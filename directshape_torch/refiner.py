@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import PurePath
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -35,21 +35,9 @@ from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.state.cars import CarBatch, CarState
 
-
-class KnownRig(Protocol):
-    """This is what is known of the rig that frames come from, for example a `rig.estimate.RigEstimate`."""
-
-    def corrected(self, frames: FrameBatch) -> FrameBatch:
-        """Frames whose camera has the rig's disparity field."""
-        ...
-
-    def informed(self, frames: FrameBatch, detections: Detections) -> Detections:
-        """Detections with standard deviations of depths and of the rig's offset, where they bring none."""
-        ...
-
-    def detector_sigmas(self) -> Tensor | None:
-        """Standard deviations (7,) of the detector, see `refinement.fusion.fused`; None if nothing is known."""
-        ...
+if TYPE_CHECKING:
+    from directshape_torch.rig.estimate import RigEstimate
+    from directshape_torch.rig.rigs import RigEstimates
 
 
 class DirectShapeRefiner(nn.Module):
@@ -81,7 +69,7 @@ class DirectShapeRefiner(nn.Module):
         prior: ShapePrior | None = None,
         config: RefinerConfig | None = None,
         extra_terms: Sequence[TermFactory] = (),
-        rig: KnownRig | None = None,
+        rig: RigEstimate | RigEstimates | None = None,
     ) -> None:
         super().__init__()
         if isinstance(prior, RefinerConfig):
@@ -172,12 +160,6 @@ class DirectShapeRefiner(nn.Module):
             return None
         learnt = None if self.rig is None else self.rig.detector_sigmas()
         return (UNKNOWN_DETECTOR if learnt is None else learnt) / math.sqrt(self.config.priors.detector_weight)
-
-    def _is_rig_unknown(self, frames: FrameBatch) -> bool:
-        """Whether the camera error is unknown: frames have no disparity field and its sigma is not set to 0."""
-        is_known = frames.camera.disparity_field is not None or self.config.rig.disparity_sigma_px == 0
-        # Points of stereo have no unknown offset.
-        return not is_known and not self.config.fits_points
 
     def _warn_of(self, frames: FrameBatch, detections: Detections) -> None:
         """Warn of mistakes that the tensors of this call show, as the setting `check` asks."""
@@ -295,8 +277,9 @@ class DirectShapeRefiner(nn.Module):
         return frames, informed
 
     def _cars(self, frames: FrameBatch, detections: Detections) -> CarBatch:
-        sigma_px = self.config.rig.disparity_sigma_px if self._is_rig_unknown(frames) else 0.0
-        return CarBatch.from_scene(frames, detections, sigma_px)
+        # Points of stereo have no unknown offset.
+        is_known = frames.camera.disparity_field is not None or self.config.fits_points
+        return CarBatch.from_scene(frames, detections, 0.0 if is_known else self.config.rig.disparity_sigma_px)
 
     def _input_state(self, cars: CarBatch) -> CarState:
         code = self.prior.initial_code(len(cars)).to(cars.detector_T_cam_obj)

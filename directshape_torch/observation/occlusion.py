@@ -15,16 +15,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from directshape_torch.errors import InputError
 from directshape_torch.rows import OcclusionMap
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import Side
 from directshape_torch.scene.masks import MASK_THRESHOLD, MaskCrops
 
-OcclusionOrder = Literal["depth", "box_bottom"]
 
-
-def occlusion_map(detections: Detections, side: Side, order: OcclusionOrder = "depth") -> OcclusionMap:
+def occlusion_map(detections: Detections, side: Side, order: Literal["depth", "box_bottom"] = "depth") -> OcclusionMap:
     """The map of what hides the B objects in one image.
 
     Args:
@@ -34,9 +31,6 @@ def occlusion_map(detections: Detections, side: Side, order: OcclusionOrder = "d
             or not in front of the camera) is ordered by its box. "box_bottom": the instance with the lower bottom edge
             of the left 2D box is in front, as in the paper. Equal numbers and NaN hide nothing.
 
-    Raises:
-        InputError: unknown side or order.
-
     Examples:
         >>> masks = torch.zeros(2, 40, 60)
         >>> masks[0, 10:20, 10:30], masks[1, 10:20, 20:40] = 1.0, 1.0
@@ -45,8 +39,6 @@ def occlusion_map(detections: Detections, side: Side, order: OcclusionOrder = "d
         >>> hidden.at(torch.tensor([0, 1, 1]), torch.tensor([[25, 15], [25, 15], [35, 15]]))
         tensor([False,  True, False])
     """
-    if side not in ("left", "right"):
-        raise InputError("side", "'left' or 'right'", repr(side))
     frame, numbers, limits = _instances(detections, order)
     masks = _masks(detections, side)
     boxes, crops = masks.boxes.tolist(), [masks.crop(row) for row in range(len(masks))]
@@ -75,8 +67,6 @@ def occlusion_map(detections: Detections, side: Side, order: OcclusionOrder = "d
 
 def _instances(detections: Detections, order: str) -> tuple[Tensor, Tensor, Tensor]:
     """Frames and numbers (B + M, 2) of all instances, and limits (B, 2) below which they are in front of detections."""
-    if order not in ("depth", "box_bottom"):
-        raise InputError("order", "'depth' or 'box_bottom'", repr(order))
     d, others = detections, detections.occluders
     frame, depth_m, bottom_v = d.frame_index, d.T_cam_obj[:, 2, 3], d.box_2d[:, 3]
     limits = torch.stack([torch.where(depth_m > 0, depth_m, -torch.inf), -bottom_v], dim=1)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import pytest
 import torch
 from reference.occlusion import hidden_pixels as one_by_one
 from torch import Tensor
 
-from directshape_torch.errors import InputError
-from directshape_torch.observation.occlusion import OcclusionOrder, occlusion_map
+from directshape_torch.observation.occlusion import occlusion_map
 from directshape_torch.scene.detections import Detections, Occluders
 from directshape_torch.scene.frames import Side
 
@@ -61,7 +61,7 @@ def hidden_pixels(detections: Detections, side: Side, object_index: Tensor, uv: 
     return hidden
 
 
-def instances_in_front(detections: Detections, side: Side, order: OcclusionOrder = "depth") -> Tensor:
+def instances_in_front(detections: Detections, side: Side, order: Literal["depth", "box_bottom"] = "depth") -> Tensor:
     """Which instance hides which detection (B + M, B), from masks in which each covers a pixel of its own."""
     others, count = detections.occluders, len(detections)
     num_instances = count + (0 if others is None else len(others.frame_index))
@@ -180,11 +180,3 @@ def test_outside_the_image_and_no_objects() -> None:
     none = torch.zeros(0, dtype=torch.long)
     assert hidden_pixels(nobody, "left", none, none.reshape(0, 2)).shape == (0,)
     assert occlusion_map(nobody, "left").at(none, none.reshape(0, 2)).shape == (0,)
-
-
-def test_wrong_input_is_named() -> None:
-    detections = scene([10.0], [0.0])
-    with pytest.raises(InputError, match="order: expected 'depth' or 'box_bottom', got 'height'"):
-        occlusion_map(detections, "left", "height")
-    with pytest.raises(InputError, match="side: expected 'left' or 'right', got 'top'"):
-        occlusion_map(detections, "top")
