@@ -31,8 +31,11 @@ def tensors_of_the_bundled_frame() -> dict[str, object]:
     }
 
 
-def test_a_dozen_lines_refine_tensors() -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+@pytest.mark.parametrize("with_boxes", [False, True], ids=["masks alone", "boxes"])
+def test_a_dozen_lines_refine_tensors(with_boxes: bool) -> None:
+    code, boxes = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    if with_boxes:
+        code = re.sub(r"cars = .*\n", boxes, code)
     names = tensors_of_the_bundled_frame()
 
     exec(compile(code, "README.md", "exec"), names)
