@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import configparser
 import re
 from pathlib import Path
 
@@ -43,3 +44,12 @@ def test_the_walk_names_files_that_exist() -> None:
             folder = package / named[-1] if named else package
         for name in re.findall(r"`([\w/]+\.py)`", line):
             assert (package / name).is_file() or (folder / name).is_file(), (name, line)
+
+
+def test_the_picture_has_the_layers_that_imports_obey() -> None:
+    imports = configparser.ConfigParser()
+    imports.read(ROOT / ".importlinter")
+    layers = imports["importlinter:contract:layers"]["layers"].split("\n")
+    picture = (ROOT / "docs" / "images" / "architecture.svg").read_text(encoding="utf-8")
+    drawn = re.findall(r'class="layer"[^>]*>([^<]+)<', picture)
+    assert drawn == [layer.strip().replace(" | ", ", ") for layer in layers if layer.strip(" _") not in ("", "main")]
