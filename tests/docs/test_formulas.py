@@ -36,6 +36,10 @@ def test_every_formula_is_drawn(tmp_path: Path) -> None:
         # What the converter does not know it writes as text.
         assert "\\" not in drawn, name
         assert drawn.count("<math") == formulas_of(page), name
+        # Chromium draws no `menclose`, and without a mathematical font no bracket of a given size.
+        assert "<menclose" not in drawn, name
+        assert "minsize" not in drawn, name
+        assert drawn.count('class="boxed"') == page.read_text(encoding="utf-8").count(r"\boxed"), name
 
 
 def formulas_of(page: Path) -> int:
