@@ -55,7 +55,7 @@ class Observability(CarRecord):
         Examples:
             >>> direction = torch.tensor([0.45, 0.0, 0.0, 0.0, 0.89, 0.0, 0.0]).expand(1, 7, 7)
             >>> Observability(torch.full((1, 7), 0.6), direction, torch.tensor([-math.pi / 2])).words()
-            ['rear view: length and depth trade 1 to 0.5 (sigma 0.60 m)']
+            ['rear view: length and depth are uncertain together, 1 to 0.5 (sigma 0.60 m)']
         """
         rows = zip(self.viewing_angle_rad.tolist(), self.directions[:, 0].tolist(), self.sigmas_m[:, 0], strict=True)
         return [
@@ -88,7 +88,7 @@ def direction_in_words(direction: Sequence[float]) -> str:
     if len(named) == 1:
         return f"{names[0]} alone"
     ratios = " to ".join(f"{direction[i] / first + 0.0:.1f}".removesuffix(".0") for i in named)
-    return f"{', '.join(names[:-1])} and {names[-1]} trade {ratios}"
+    return f"{', '.join(names[:-1])} and {names[-1]} are uncertain together, {ratios}"
 
 
 def covariance_of(fisher: Tensor) -> Tensor:

@@ -47,7 +47,7 @@ def test_from_behind_length_is_what_is_missing_and_depth_goes_with_it() -> None:
     assert int(weakest.abs().argmax()) == LENGTH
     # The visible end stays where it is: a car longer by one has its middle half of that further away.
     assert 0.2 < float(weakest[DEPTH] / weakest[LENGTH]) < 0.8
-    assert behind.words()[0].startswith("rear view: length and depth trade 1 to 0.")
+    assert behind.words()[0].startswith("rear view: length and depth are uncertain together, 1 to 0.")
 
 
 def test_from_the_side_length_is_seen() -> None:
@@ -126,8 +126,8 @@ def test_no_cars_and_no_images() -> None:
     ("direction", "words"),
     [
         ([0, 0, 0, 0, 1, 0, 0], "length alone"),
-        ([-0.45, 0, 0, 0, 0.89, 0, 0], "length and depth trade 1 to -0.5"),
-        ([0.7, 0, 0, 0.5, 0.5, 0, 0], "depth, heading and length trade 1 to 0.7 to 0.7"),
+        ([-0.45, 0, 0, 0, 0.89, 0, 0], "length and depth are uncertain together, 1 to -0.5"),
+        ([0.7, 0, 0, 0.5, 0.5, 0, 0], "depth, heading and length are uncertain together, 1 to 0.7 to 0.7"),
     ],
 )
 def test_words_of_directions(direction: list[float], words: str) -> None:

@@ -62,7 +62,7 @@ def test_exact_points_lead_to_the_truth(method: str) -> None:
 
 
 def test_alternating_creeps_to_where_the_joint_refinement_jumps() -> None:
-    """Of one cost: where length and depth trade, alternating steps are small, and more rounds only lower the cost."""
+    """Alternating steps are small where length and depth are uncertain together; more rounds only lower the cost."""
     exact = replace(DEFAULT.solver, cost_tolerance=1e-12, step_tolerance=1e-9)
     rounds = [refine(replace(ALTERNATING, solver=exact, stages=n * ROUND), *scene_of()) for n in (1, 4, 16)]
     joint = refine(replace(JOINT, solver=exact), *scene_of())
