@@ -340,11 +340,10 @@ class AcceptanceConfig(Settings):
 class RefinerConfig(Settings):
     """Everything `DirectShapeRefiner` can be told."""
 
-    compile: Literal["auto", "on", "off"] = setting(
-        "auto",
-        'compile the hot functions: "on", "off", or "auto" (where there is a C++ compiler and the command refine has '
-        'a job of at least 3000 cars). Compiled results differ in the last digits: "on" or "off" repeats them '
-        "to the bit",
+    compile: Literal["on", "off"] = setting(
+        "off",
+        "compile what native loops leave to tensor operations by torch.compile, for a graphics card "
+        "(docs/performance.md); results differ in the last digits",
     )
     check: Literal["first", "always", "off"] = setting(
         "first",

@@ -111,7 +111,7 @@ class DirectShapeRefiner(nn.Module):
             InputError: frames, detections and prior do not fit together; a term that does not exist; gradients are
                 wanted of a prior that has none, or in forward mode; masks with values above 1.5.
             ConfigError: every term has weight zero.
-            CompilationError: `compile: on` where something must be compiled and cannot be.
+            CompilationError: `compile: on` where no compiler works.
         """
         if torch.compiler.is_compiling():
             # A compiled model around the refiner gets one graph break here, because the iterations decide by values all
@@ -133,7 +133,7 @@ class DirectShapeRefiner(nn.Module):
         with (
             torch.set_grad_enabled(differentiate),
             full_precision(),
-            compiling(self.config.compile),
+            compiling(self.config.compile, self.prior.origin.device),
         ):
             result, cars = self._refine(frames, detections, term_weights=term_weights, detector_noise=noise)
             result = result if noise is None else fused(result, cars)

@@ -6,10 +6,8 @@ import hypothesis
 import pytest
 import torch
 
-from directshape_torch import compile as compile_module
-
 # Fixtures that several files share.
-pytest_plugins = ("helpers.compiled_lookup", "helpers.run_fixtures")
+pytest_plugins = ("helpers.run_fixtures",)
 
 # The same examples in every run: a failure that comes and goes helps nobody.
 hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None)
@@ -21,9 +19,3 @@ torch.set_num_threads(1)
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)
-
-
-@pytest.fixture(autouse=True)
-def _fresh_count_of_cars(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reset the count of cars of the process, by which `compile: auto` would change the form within a test."""
-    monkeypatch.setattr(compile_module, "_process", compile_module._Process())

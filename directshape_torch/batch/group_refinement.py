@@ -15,7 +15,6 @@ from directshape_torch.batch.frame_groups import FrameGroup
 from directshape_torch.batch.frame_outputs import failed_entry, write_frame_outputs
 from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.run_summary import RunTimings, peak_device_memory_mb, peak_memory_mb
-from directshape_torch.compile import cars_ahead
 from directshape_torch.errors import CompilationError, DirectShapeError, MissingDependencyError
 from directshape_torch.io.frame_collation import collate, split_by_rig
 from directshape_torch.io.run_log import OutputLostError, writing_to
@@ -39,8 +38,6 @@ class RunJob:
     # Hashes of the manifest and of the shape prior.
     run: str
     prior_sha256: str
-    # Estimated number of cars of the whole run, so that every process decides alike whether to compile.
-    expected_cars: int
 
 
 @dataclass
@@ -129,8 +126,7 @@ class _GroupStep:
         prior = self.job.refiner.prior.origin
         frames, detections = collate(batch)
         frames, detections = frames.to(prior.device, prior.dtype), detections.to(prior.device, prior.dtype)
-        # The number is set again before each call, so that earlier calls of this process do not matter.
-        with cars_ahead(self.job.expected_cars), self.report.timings.measure(frames.frame_ids, len(detections)):
+        with self.report.timings.measure(frames.frame_ids, len(detections)):
             result: RefinementResult = self.job.refiner(frames, detections)
         return result
 

@@ -29,9 +29,6 @@ from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
 
-# The number of cars is estimated from this many detection files.
-_FRAMES_COUNTED = 50
-
 
 def refine_dataset(
     dataset: StereoDataset,
@@ -70,9 +67,7 @@ def refine_dataset(
         is_cleared = fresh and remove_results(out_dir)
         manifest = run_manifest(dataset, refiner, options.batch_frames)
         earlier = EarlierResults(out_dir, manifest, options.outputs, is_cleared)
-        # All frames count, also finished ones, because a resumed run must make the same decision.
-        num_cars = expected_cars(dataset, dataset.frame_ids)
-        job = RunJob(dataset, refiner, out_dir, options, manifest.hash, manifest.sha256["prior"], num_cars)
+        job = RunJob(dataset, refiner, out_dir, options, manifest.hash, manifest.sha256["prior"])
         return _Run(job, earlier, log, observer or RunObserver()).execute()
 
 
@@ -196,18 +191,6 @@ class _Run:
 
 def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:5]) + (" .." if len(names) > 5 else "")
-
-
-def expected_cars(dataset: StereoDataset, frame_ids: Sequence[str]) -> int:
-    """Estimated number of cars in frames, from some detection files; it decides whether compiling is worthwhile."""
-    looked_at = frame_ids[:: max(1, len(frame_ids) // _FRAMES_COUNTED)]
-    count = 0
-    for frame_id in looked_at:
-        # A file that cannot be read is reported when its frame is refined.
-        with contextlib.suppress(DirectShapeError, OSError):
-            objects = dataset.objects(frame_id)
-            count += sum(found.type in dataset.classes for found in objects)
-    return round(count * len(frame_ids) / max(1, len(looked_at)))
 
 
 def has_tracks(dataset: StereoDataset) -> bool:

@@ -13,7 +13,6 @@ from typing import Any
 
 import torch
 
-from directshape_torch.compile import num_forms
 from directshape_torch.files.atomic_files import write_json
 from directshape_torch.status import Status, counted
 
@@ -31,7 +30,6 @@ class CallTiming:
     frame_ids: tuple[str, ...]  # frames of the call
     num_cars: int  # number of its cars
     refine_s: float  # duration in seconds
-    compiled: int = 0  # functions that were compiled or loaded in it
 
 
 @dataclass
@@ -51,11 +49,11 @@ class RunTimings:
     def measure(self, frame_ids: Sequence[str], num_cars: int) -> Iterator[None]:
         """Measure the body as one call; wait for the device before and after."""
         _wait_for(self.device)
-        start, forms = time.perf_counter(), num_forms()
+        start = time.perf_counter()
         yield
         _wait_for(self.device)
         seconds = time.perf_counter() - start
-        self.calls.append(CallTiming(tuple(frame_ids), num_cars, seconds, num_forms() - forms))
+        self.calls.append(CallTiming(tuple(frame_ids), num_cars, seconds))
 
     def add(self, other: RunTimings) -> None:
         """Add the timings of another process."""
@@ -232,9 +230,7 @@ def format_summary(summary: RunSummary) -> str:
     if timings.ms_per_frame is not None:
         per_car = "" if timings.ms_per_car is None else f"{timings.ms_per_car:.0f} ms per car, "
         where = device_name(timings.device)
-        # Compiling is part of the calls that need it, and takes most of the time of a short run.
-        compiling = " with compiling or loading code" if any(call.compiled for call in timings.calls) else ""
-        lines.append(f"time     {per_car}{timings.ms_per_frame:.0f} ms per frame (refinement only{compiling}, {where})")
+        lines.append(f"time     {per_car}{timings.ms_per_frame:.0f} ms per frame (refinement only, {where})")
     if timings.workers > 1 and timings.wall_s:
         rate = timings.num_frames / timings.wall_s
         lines.append(f"rate     {rate:.2f} frames a second by {timings.workers} workers (everything included)")

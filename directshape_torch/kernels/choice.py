@@ -50,14 +50,12 @@ def native_grid(field: object, *tensors: Tensor) -> arguments.Grid | None:
         field: signed distances of the cars.
         tensors: what else a loop gets, at least one tensor of each origin.
     """
-    # The compiler of tensor operations must see nothing else, and a subclass of the shape may look up anew.
-    if torch.compiler.is_compiling() or type(field) is not GridShape:
-        return None
-    if not _is_on.get() or not nothing_is_differentiated():
+    # A subclass of the shape may look up anew. No tensor is fit while the user's own compiler looks.
+    if type(field) is not GridShape or not nothing_is_differentiated():
         return None
     if not all(map(_is_fit, (field.values, field.basis, *tensors))):
         return None
-    return _grid(field) if _is_installed() else None
+    return _grid(field) if _is_on.get() and _is_installed() else None
 
 
 def _is_fit(tensor: Tensor) -> bool:

@@ -34,7 +34,7 @@ class Dense:
 
 
 def dense_of(hint: object) -> Dense | None:
-    """The declaration in the type of a field or of an argument, if there is one."""
+    """The declaration in the type of a field, if there is one."""
     return next((each for each in getattr(hint, "__metadata__", ()) if isinstance(each, Dense)), None)
 
 

@@ -3,8 +3,7 @@
 A table is a named tuple, or a frozen dataclass derived from `Table`. A field `Annotated[Tensor, Dense("B", 3)]` has a
 row for each car, and `Annotated[tuple[int, ...], Dense("B")]` has a number for each car that the host knows. Another
 axis belongs to cars if the table, or a table in it, has the car of each row: `Annotated[Tensor, Dense("M",
-numbers_of="B")]`, as `Blocks` do. All cars share the values of a field without declaration. The sizes of the axes
-B of cars, M of blocks and A of any entries vary from call to call, which compiled code must know.
+numbers_of="B")]`, as `Blocks` do. All cars share the values of a field without declaration.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ from directshape_torch.errors import InputError
 from directshape_torch.numerics.records import Dense, dense_of
 
 _T = TypeVar("_T")
-_VARYING = frozenset("BMA")
 
 
 class _Kept:
@@ -104,11 +102,6 @@ def _declared_by(kind: type) -> dict[str, Dense | None]:
         cure = "import the types of its fields at the top of the module, outside of TYPE_CHECKING"
         raise InputError(kind.__name__, "fields whose types are known at run time", str(error), cure) from error
     return {name: dense_of(hints.get(name)) for name in names}
-
-
-def varying_axes(spec: Dense | None) -> list[int]:
-    """The axes whose sizes vary from call to call."""
-    return [] if spec is None else [axis for axis, letter in enumerate(spec.shape) if letter in _VARYING]
 
 
 def is_table(value: object) -> bool:

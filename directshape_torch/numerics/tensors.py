@@ -17,9 +17,6 @@ def take(
     index: Tensor,  # (*,) integer, 0 .. A - 1
 ) -> Tensor:
     """The entries (*,) of a flat tensor at indices of any shape."""
-    if torch.compiler.is_compiling():
-        # One step instead of three gives the same compiled code, and every step costs the compiler milliseconds.
-        return flat[index]
     return flat.index_select(0, index.reshape(-1)).view(index.shape)
 
 
@@ -89,7 +86,7 @@ def length(vectors: Tensor, dim: int) -> Tensor:
 def all_along(flags: Tensor, dim: int) -> Tensor:
     """The result of `flags.all(dim)`, fast for an axis with few entries."""
     if torch.compiler.is_compiling():
-        return flags.all(dim)  # one step to trace, and the compiler writes the loop
+        return flags.all(dim)  # PyTorch 2.13 makes wrong C++ of the view.
     return flags.view(torch.uint8).amin(dim).view(torch.bool)
 
 
@@ -100,17 +97,4 @@ def not_negative(values: Tensor) -> Tensor:
         >>> not_negative(torch.tensor([2.0, -2.0, torch.nan]))
         tensor([2., 0., 0.])
     """
-    if torch.compiler.is_compiling():
-        # The compiler turns `nan_to_num` into a loop over single numbers.
-        return torch.where(values >= 0, values, 0.0)
     return values.nan_to_num(0.0).clamp_min(0)
-
-
-def cross(left: Tensor, right: Tensor) -> Tensor:
-    """Cross products (*, 3) of vectors (*, 3)."""
-    if not torch.compiler.is_compiling():
-        product: Tensor = torch.linalg.cross(left, right)
-        return product
-    # In PyTorch's own function the compiler would look up each component by a computed index.
-    (x, y, z), (u, v, w) = ([vectors[..., k] for k in range(3)] for vectors in (left, right))
-    return torch.stack([y * w - z * v, z * u - x * w, x * v - y * u], dim=-1)

@@ -265,11 +265,11 @@ def _thinned(term: Photometric, max_pixels: int) -> tuple[PhotometricRows, Tenso
 def shifted_costs(
     rows: PhotometricRows,
     config: PhotometricConfig,
-    parts: Annotated[Tensor, Dense("Q", "B", "R")],  # which pixels count in each of Q costs, 0 or 1
-    depth: Annotated[Tensor, Dense("S", "B", "R")],  # of S surfaces, metres
-    on_surface: Annotated[Tensor, Dense("S", "B", "R", kind="flags")],
-    per_px: Annotated[Tensor, Dense("B")],  # inverse depth that a pixel of disparity is worth
-    offsets_px: Annotated[Tensor, Dense("A")],
+    parts: Tensor,  # (Q, B, R) which pixels count in each of Q costs, 0 or 1
+    depth: Tensor,  # (S, B, R) of S surfaces, metres
+    on_surface: Tensor,  # (S, B, R) bool
+    per_px: Tensor,  # (B,) inverse depth that a pixel of disparity is worth
+    offsets_px: Tensor,  # (n,)
 ) -> Tensor:
     """Costs (Q, S, n, B), float64, of Q parts of the pixels of each car, with S surfaces moved by n disparities."""
     inverse = 1 / depth[:, None] + offsets_px[:, None, None] * per_px[:, None]

@@ -14,7 +14,6 @@ from typing import Annotated, Any, TypeAlias, cast
 import torch
 from torch import Tensor
 
-from directshape_torch.compile import will_compile, with_varying
 from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.numerics.gradient_mode import map_tensors
 from directshape_torch.numerics.records import Dense
@@ -77,15 +76,13 @@ class CarProblem(Table):
     ) -> tuple[Part[Any], ...]:
         """What terms of the problem, for all or fewer cars, say of a state; `fisher` asks for the Fisher information.
 
-        The library's terms are evaluated in one function, which is compiled as a whole. A user's terms are evaluated
-        separately, so that they cannot disturb the compiled function. They may mark their own functions
-        `compile.compilable`.
+        A user's terms are evaluated separately, so that they cannot disturb the function of the library's terms, which
+        is compiled as a whole. They may mark their own functions `compile.compilable`.
         """
         own = len(terms) - len(self.extra_terms)
         extra = zip(terms[own:], anchors[own:], strict=True)
         of_extra = tuple(part_of(term, linear_of(term, self.prior, field, state, anchor)) for term, anchor in extra)
-        # Compiled code always computes the Fisher information, so that it has one form.
-        return parts_of(terms[:own], field, state, anchors[:own], fisher or will_compile()) + of_extra
+        return parts_of(terms[:own], field, state, anchors[:own], fisher) + of_extra
 
     def prepare(self, state: State) -> Prepared:
         """March every ray at a state: what rays see are constants, but state and field keep their graphs."""
@@ -134,16 +131,10 @@ class CarStage:
         seen = [part for part, prior in zip(figures.information.unbind(1), is_prior, strict=True) if not prior]
         return torch.stack(seen).sum(dim=0) if seen else None
 
-    @cached_property
-    def _constant_terms(self) -> tuple[AnyTerm, ...]:
-        """The terms in the form of compiled code, in which they are constants; `terms` may be differentiated."""
-        return tuple(with_varying(term) for term in self.terms)
-
     def figures(self, prepared: Prepared) -> Figures:
         """The energy of each column at a state, with every ray marched; differentiable if gradients are enabled."""
-        terms = self.terms if torch.is_grad_enabled() else self._constant_terms
-        anchors = tuple(term.anchor(prepared) for term in terms)
-        parts = self.problem.parts(terms, prepared.field, prepared.state, anchors)
+        anchors = tuple(term.anchor(prepared) for term in self.terms)
+        parts = self.problem.parts(self.terms, prepared.field, prepared.state, anchors)
         layout = _Layout.of(self.terms, self.problem.factors)
         cells = CarSums.of(layout.owner * layout.num_columns + layout.column, layout.num_cars * layout.num_columns)
         cost, products = (torch.cat(x) for x in zip(*(part[:2] for part in parts), strict=True))
@@ -181,12 +172,8 @@ class CarStage:
         return iterations, iterations.evaluated(prepared.field, prepared.state, anchors)
 
     def _iterated_terms(self) -> tuple[AnyTerm, ...]:
-        """The terms with the library's priors joined, if cars have no factors; a user's terms stay separate.
-
-        Compiled code does not join priors: it has one form for this and for `figures`, and separate priors cost nothing
-        there.
-        """
-        if self.problem.factors is not None or will_compile():
+        """The terms with the library's priors joined, if cars have no factors; a user's terms stay separate."""
+        if self.problem.factors is not None:
             return self.terms
         own = len(self.problem.evidence)
         return (*with_joined_priors(self.terms[:own]), *self.terms[own:])
@@ -276,10 +263,6 @@ class CarIterations(Table):
     def _sums(self) -> CarSums:
         return self.layout.sums()
 
-    @cached_property
-    def _constant_terms(self) -> tuple[AnyTerm, ...]:
-        return tuple(with_varying(term) for term in self.terms)
-
     def evaluate(self, state: State, near: Evaluation) -> Evaluation:
         """The energy at a state; the anchors of the terms come from the evaluation `near`."""
         problem = self.stage.problem
@@ -290,12 +273,12 @@ class CarIterations(Table):
 
     def evaluated(self, field: Field, state: State, anchors: tuple[object, ...]) -> Evaluation:
         """The energy at a state; the terms are evaluated near their anchors."""
-        problem, terms = self.stage.problem, self._constant_terms
-        parts = problem.parts(terms, field, state, anchors, fisher=False)
+        problem = self.stage.problem
+        parts = problem.parts(self.terms, field, state, anchors, fisher=False)
         if problem.config.solver.jacobian == "autograd":
             anchors = tuple(part.anchor for part in parts)
-            rows = by_autograd(terms, problem.prior, state, anchors)
-            parts = tuple(part_of_rows(t, *r, anchor) for t, r, anchor in zip(terms, rows, anchors, strict=True))
+            rows = by_autograd(self.terms, problem.prior, state, anchors)
+            parts = tuple(part_of_rows(t, *r, anchor) for t, r, anchor in zip(self.terms, rows, anchors, strict=True))
         at = summed(self._sums, self.layout.weight, parts)
         cost = at.cost if self.rest is None else at.cost + self.rest
         return self.stage.without_held(at._replace(cost=cost))

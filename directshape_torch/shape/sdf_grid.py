@@ -17,7 +17,7 @@ derivative of the least distance is then the derivative at the fixed point, with
 from __future__ import annotations
 
 import math
-from typing import Annotated, NamedTuple, Self, TypeAlias
+from typing import Annotated, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -55,9 +55,7 @@ class GridShape(NamedTuple):
     values: Annotated[Tensor, Dense("B", "nx", "ny", "nz")]  # signed distance at the nodes, metres
     basis: Tensor  # (nx, ny, nz, K) derivative of the nodes by the code, metres per standard deviation
     origin: Tensor  # (3,) position of node (0, 0, 0) in the object frame, metres
-    # (3,) number of the last node along each axis; a tensor, because the compiler turns constants into choices, which
-    # cost as much as sums
-    last: Tensor
+    last: Tensor  # (3,) number of the last node along each axis
     spacing_m: float  # distance between nodes, metres
 
     @classmethod
@@ -101,10 +99,13 @@ class GridShape(NamedTuple):
         cells = cells_at(self, points_obj)
         value, gradient = _value_and_gradient(self, cells, owner, inside)
         table, corners = self.basis.flatten(0, 2), at_corners(self, cells.lower_node)
-        if constant and isinstance(corners, Tensor):
+        if constant:
             return SdfDerivatives(value, gradient, _summed(table, corners, cells.fraction))
         rows = [embedding(corner, table) for corner in corners]
-        return SdfDerivatives(value, gradient, _interpolated(rows, cells.fraction[..., None]))
+        for along in reversed(cells.fraction[..., None].unbind(0)):
+            ends = zip(rows[: len(rows) // 2], rows[len(rows) // 2 :], strict=True)
+            rows = [torch.addcmul(lower, along, upper - lower) for lower, upper in ends]
+        return SdfDerivatives(value, gradient, rows[0])
 
     def minimum_along(
         self,
@@ -219,18 +220,10 @@ def nodes_of(grid: GridShape, node: Tensor, owner: Tensor) -> Tensor:
     return torch.add(node, owner[..., None].int(), alpha=math.prod(grid.basis.shape[:3]))
 
 
-# `Ends` are values at the ends of edges: one tensor (n, ...), or n tensors (...) for the compiler, which makes one loop
-# of tensors of one shape.
-Ends: TypeAlias = Tensor | list[Tensor]
-
-
-def at_corners(grid: GridShape, node: Tensor) -> Ends:
+def at_corners(grid: GridShape, node: Tensor) -> Tensor:
     """Flat indices (8, ...) of the corners of cells, z outermost: 000, 100, 010, 110, 001, 101, 011, 111."""
     x, y, z = strides(grid)
     offsets = tuple(i * x + j * y + k * z for k in (0, 1) for j in (0, 1) for i in (0, 1))
-    if torch.compiler.is_compiling():
-        # The compiler would turn a table of numbers into choices, which keep it from using vector instructions.
-        return [node + offset for offset in offsets]
     return node + constant_like(offsets, node).view(8, *[1] * node.ndim)
 
 
@@ -249,43 +242,24 @@ def cells_at(grid: GridShape, points_obj: Tensor) -> Cells:
     return Cells(lower_nodes(grid, lower), clamped - lower, position, clamped)
 
 
-def corner_values(grid: GridShape, node: Tensor) -> Ends:
+def corner_values(grid: GridShape, node: Tensor) -> Tensor:
     """Signed distances (8, ...) at the corners of cells, from their lower nodes (...) among the nodes of all grids."""
     corners = at_corners(grid, node)
-    if isinstance(corners, list):
-        # The compiler knows that indices of an embedding are at least 0.
-        return [embedding(corner, grid.values.reshape(-1, 1))[..., 0] for corner in corners]
     return grid.values.reshape(-1).index_select(0, corners.view(-1)).view(corners.shape)
 
 
-def halves(ends: Ends) -> tuple[Ends, Ends]:
-    """The lower half of the ends, along the outermost remaining axis, and the rises from there to the upper half."""
-    if isinstance(ends, list):
-        half = len(ends) // 2
-        return ends[:half], [upper - lower for lower, upper in zip(ends[:half], ends[half:], strict=True)]
+def halves(ends: Tensor) -> tuple[Tensor, Tensor]:
+    """The lower half of values at the ends of edges (n, ...), and the rises from there to the upper half."""
     lower, upper = ends.chunk(2)
     return lower, upper - lower
-
-
-def moved(lower: Ends, fraction: Tensor, rise: Ends) -> Ends:
-    """The ends `lower + fraction rise`."""
-    if isinstance(lower, list):
-        return [torch.addcmul(low, fraction, along) for low, along in zip(lower, rise, strict=True)]
-    assert isinstance(rise, Tensor)
-    return torch.addcmul(lower, fraction, rise)
-
-
-def scaled(factor: Tensor, ends: Ends) -> Ends:
-    """The ends times a factor."""
-    return [factor * end for end in ends] if isinstance(ends, list) else factor * ends
 
 
 def _value_and_gradient(grid: GridShape, cells: Cells, owner: Tensor, in_grid: bool = False) -> tuple[Tensor, Tensor]:
     fx, fy, fz = cells.fraction
     lower, along_z = halves(corner_values(grid, nodes_of(grid, cells.lower_node, owner)))
-    lower, along_y = halves(moved(lower, fz, along_z))
-    lowest, along_x = halves(moved(lower, fy, along_y))
-    inside = moved(lowest, fx, along_x)[0]
+    lower, along_y = halves(torch.addcmul(lower, fz, along_z))
+    lowest, along_x = halves(torch.addcmul(lower, fy, along_y))
+    inside = torch.addcmul(lowest, fx, along_x)[0]
     along_z = _between(along_z, fy)
     slope = torch.stack([x[0] for x in (along_x, _between(along_y, fx), _between(along_z, fx))])
     slope = slope * (1 / grid.spacing_m)
@@ -296,12 +270,12 @@ def _value_and_gradient(grid: GridShape, cells: Cells, owner: Tensor, in_grid: b
     return torch.add(inside, distance, alpha=grid.spacing_m), gradient
 
 
-def _between(ends: Ends, fraction: Tensor) -> Ends:
+def _between(ends: Tensor, fraction: Tensor) -> Tensor:
     lower, rise = halves(ends)
-    return moved(lower, fraction, rise)
+    return torch.addcmul(lower, fraction, rise)
 
 
-def _interpolated(corners: Ends, fraction: Tensor) -> Tensor:
+def _interpolated(corners: Tensor, fraction: Tensor) -> Tensor:
     """The values inside cells, from their corners (8, ...) and the fractions (3, ...) along the axes."""
     for along in reversed(fraction.unbind(0)):
         corners = _between(corners, along)
@@ -336,12 +310,12 @@ def _derivatives_along(grid: GridShape, node: Tensor, place: Tensor, step: Tenso
     (ux, uy, uz), (dx, dy, dz) = place, step
     # The corners are interpolated along z, then y, then x, and each time the polynomial of the distance gains a degree.
     lower, rise = halves(corner_values(grid, node))
-    (a0, rise_0), (a1, rise_1) = halves(moved(lower, uz, rise)), halves(scaled(dz, rise))
-    b1 = moved(moved(a1, uy, rise_1), dy, rise_0)
-    (_, rise_0), (b1, rise_1), (b2, rise_2) = map(halves, (moved(a0, uy, rise_0), b1, scaled(dy, rise_1)))
-    first = moved(moved(b1, ux, rise_1), dx, rise_0)
-    second = moved(moved(b2, ux, rise_2), dx, rise_1)
-    return _AlongRay(first[0], second[0], scaled(dx, rise_2)[0])
+    (a0, rise_0), (a1, rise_1) = halves(torch.addcmul(lower, uz, rise)), halves(dz * rise)
+    b1 = torch.addcmul(torch.addcmul(a1, uy, rise_1), dy, rise_0)
+    (_, rise_0), (b1, rise_1), (b2, rise_2) = map(halves, (torch.addcmul(a0, uy, rise_0), b1, dy * rise_1))
+    first = torch.addcmul(torch.addcmul(b1, ux, rise_1), dx, rise_0)
+    second = torch.addcmul(torch.addcmul(b2, ux, rise_2), dx, rise_1)
+    return _AlongRay(first[0], second[0], dx * rise_2[0])
 
 
 def _first_root(along: _AlongRay) -> Tensor:

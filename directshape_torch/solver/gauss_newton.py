@@ -27,7 +27,7 @@ from directshape_torch.solver.problem import (
 from directshape_torch.status import Status, is_refined
 
 # Ended problems are left out where that saves at least this many iterations of one problem, because the others must be
-# copied. A few problems take nearly as long as fewer, and one problem takes longer than two (it has no compiled form).
+# copied. A few problems take nearly as long as fewer.
 _WORTH_LEAVING_OUT = 16
 
 

@@ -26,7 +26,6 @@ class CarState(NamedTuple):
     @classmethod
     def of(cls, T_obj_cam: Tensor, code: Tensor, num_offsets: int = 0) -> CarState:
         """State of cars with poses (B, 4, 4), shapes (B, K) and offsets of zero."""
-        # The offsets are no view of the code, because compiled functions treat other strides as a new input form.
         return cls(T_obj_cam, code, code.new_zeros(len(code), num_offsets))
 
     @property

@@ -88,14 +88,13 @@ class March(NamedTuple):
     crosses: Tensor  # (M, R) bool
 
 
-@compilable
 def marched_views(
     left: Rays,
     right: Rays,
     bounds_obj: Tensor,
     num_samples: int,
     field: Field,
-    T_obj_cam: Annotated[Tensor, Dense("B", 4, 4)],
+    T_obj_cam: Tensor,  # (B, 4, 4)
 ) -> tuple[Closest, Hits]:
     """Closest points of the rays of both images, left first, and hits of the left rays; all are constants."""
     pairs = zip(left, right, (0, 0, 1), strict=True)
@@ -104,13 +103,20 @@ def marched_views(
     grid = native_grid(field, bounds_obj, T_obj_cam, both.centre_cam, both.ray_cam)
     if grid is not None:
         return _marched_natively(grid, native_search(bounds_obj), both, num_left, num_samples, T_obj_cam)
+    return _marched(field, both, num_left, bounds_obj, num_samples, T_obj_cam)
+
+
+@compilable
+def _marched(
+    field: Field, both: Rays, num_left: int, bounds_obj: Tensor, num_samples: int, T_obj_cam: Tensor
+) -> tuple[Closest, Hits]:
     rays = both.in_objects(T_obj_cam)
     sampled = march(field, both.owner, rays, bounds_obj, num_samples)
     closest = closest_of_march(field, both.owner, rays, bounds_obj, sampled)
     left_rays = ObjectRays(*(x[:, :num_left] for x in rays))
     sampled_left = March(*(x[..., :num_left, :] for x in sampled))
     closest_left = Closest(*(x[..., :num_left, :] for x in closest))
-    return closest, first_hits(field, left.owner, left_rays, sampled_left, closest_left)
+    return closest, first_hits(field, both.owner[:num_left], left_rays, sampled_left, closest_left)
 
 
 def native_search(bounds_obj: Tensor) -> Search:

@@ -254,17 +254,23 @@ def _block_costs(weight: Tensor, norm: RobustValue) -> Tensor:
     return (weight * norm.rho).sum(dim=-1).to(torch.float64).sum(dim=1)
 
 
-@compilable
 def parts_of(
     terms: tuple[AnyTerm, ...], field: Field, state: State, anchors: tuple[object, ...], fisher: bool = True
 ) -> tuple[Part[Any], ...]:
     """The parts of all terms at a state, with hand-derived Jacobians, near their anchors."""
 
-    def of(term: AnyTerm, anchor: object) -> Part[Any]:
-        native = term.native_part(field, state, anchor, fisher)
-        return native or part_of(term, in_all_columns(term, state, term.linear(field, state, anchor)), fisher)
+    native = [term.native_part(field, state, at, fisher) for term, at in zip(terms, anchors, strict=True)]
+    rest = [n for n, part in enumerate(native) if part is None]
+    others = iter(_parts_of(tuple(terms[n] for n in rest), field, state, tuple(anchors[n] for n in rest), fisher))
+    return tuple(part or next(others) for part in native)
 
-    return tuple(map(of, terms, anchors))
+
+@compilable
+def _parts_of(
+    terms: tuple[AnyTerm, ...], field: Field, state: State, anchors: tuple[object, ...], fisher: bool
+) -> tuple[Part[Any], ...]:
+    at = [term.linear(field, state, anchor) for term, anchor in zip(terms, anchors, strict=True)]
+    return tuple(part_of(term, in_all_columns(term, state, x), fisher) for term, x in zip(terms, at, strict=True))
 
 
 def weighted_products(

@@ -21,7 +21,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.image.interpolate import BilinearPatch, bilinear_patch
 from directshape_torch.numerics.records import Dense
 from directshape_torch.numerics.tables import Table
-from directshape_torch.numerics.tensors import constant_like, cross
+from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.rows import Blocks, CarSums
 from directshape_torch.shape.field import Field
 from directshape_torch.state.cars import CarBatch
@@ -184,7 +184,7 @@ class NextView(Term[Surface]):
         J_depth = (at.J_value_point * surface.rays.direction_obj).sum(0)[..., None] * surface.J_depth_state
         J_value_point, points = at.J_value_point.movedim(0, -1), points.movedim(0, -1)
         # A point that is fixed in this camera moves in the next one by both poses, with opposite signs.
-        J_pose = torch.cat([J_value_point, cross(points, J_value_point)], dim=-1)
+        J_pose = torch.cat([J_value_point, torch.linalg.cross(points, J_value_point)], dim=-1)
         J = torch.cat([J_depth + torch.nn.functional.pad(J_pose, (0, state.code.shape[1])), -J_pose], dim=-1)
         one = usable[..., None].to(J.dtype)
         return Linear(residual[..., None], one, J, surface.seen(anchor, surface.depth, usable))

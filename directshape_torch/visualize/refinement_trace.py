@@ -100,7 +100,7 @@ def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections
     rows = took_part.index
     everyone, inputs = refiner.problem(frames, detections)
     problem, initial = everyone.of(took_part), take_rows(inputs, rows)
-    with full_precision(), compiling(refiner.config.compile):
+    with full_precision(), compiling(refiner.config.compile, refiner.prior.origin.device):
         minimum: CarMinimum[CarState] = minimise(problem, initial, refiner.config.solver, record=True)
         states = [initial, *_ends(minimum)]
         costs = torch.stack([minimum.stage.figures(problem.prepare(state)).term_costs for state in states])

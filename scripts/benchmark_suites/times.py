@@ -11,7 +11,6 @@ import torch
 from benchmark_suites.measures import count_operations, peak_tensor_bytes
 from benchmark_suites.timing import Row, Spread, time_interleaved
 from benchmark_suites.workloads import Scene
-from directshape_torch.compile import compiler_problem
 from directshape_torch.io.config_files import load_config
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.refiner import DirectShapeRefiner
@@ -37,7 +36,7 @@ def make_refiner(preset: str, compiled: bool, *overrides: str) -> DirectShapeRef
 
 def time_rows(scene: Scene, device: torch.device, rounds: int, quick: bool = False) -> Iterator[Row]:
     """Milliseconds, operations and memory of both presets, eager and compiled, of single frames and of 8 in a call."""
-    modes = (False,) if quick or compiler_problem() is not None else (False, True)
+    modes = (False,) if quick else (False, True)
     refiners = {
         f"{preset}, {'compiled' if compiled else 'eager'}": make_refiner(preset, compiled).to(device)
         for preset in (_PRESETS[:1] if quick else _PRESETS)

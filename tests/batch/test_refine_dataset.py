@@ -4,26 +4,20 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from helpers.faulty_refiners import EVERY_RESULT, FEW_STEPS
+from helpers.faulty_refiners import EVERY_RESULT
 from helpers.kitti_folder import CODE, FRAMES, PEDESTRIAN
 from helpers.output_folders import result_files
-from helpers.quick_runs import dataset, refine
+from helpers.quick_runs import refine
 
-from directshape_torch import compile as compile_module
 from directshape_torch.batch.options import RefineOptions
-from directshape_torch.batch.refine_dataset import expected_cars
 from directshape_torch.errors import InputError
 from directshape_torch.io.config_files import load_config
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.result_files import read_shapes
-from directshape_torch.refinement.result import RefinementResult
-from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.visualize.overlay import overlay_of_frame
 
 
@@ -131,31 +125,6 @@ def test_cars_without_masks_stay_as_they_were_and_a_warning_says_so(kitti_copy: 
     assert any("none of the 6 cars has a mask" in warning for warning in summary.warnings)
     name = "data/000000.txt"
     assert (tmp_path / name).read_bytes() == (kitti_copy / "detections" / name).read_bytes()
-
-
-def test_a_long_run_compiles_from_its_first_frame_and_a_short_one_never(
-    kitti_copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert expected_cars(dataset(kitti_copy), FRAMES) == 2 * len(FRAMES)
-    assert expected_cars(dataset(kitti_copy), FRAMES[:1] * 400) == 800
-    (kitti_copy / "detections" / "data" / "000002.txt").write_text("damaged")
-    assert expected_cars(dataset(kitti_copy), FRAMES) == 2 * (len(FRAMES) - 1)
-    counts: list[int | None] = []
-
-    class Watched(DirectShapeRefiner):
-        def forward(self, *args: Any, **kwargs: Any) -> RefinementResult:
-            counts.append(compile_module._job.get())
-            return super().forward(*args, **kwargs)
-
-    monkeypatch.setattr("directshape_torch.batch.refine_dataset.expected_cars", lambda *_: 5000)
-    # The number is what counts here; compiling for it would take minutes.
-    watched = Watched(
-        PCAShapePrior.load(kitti_copy / "prior.safetensors"), load_config(None, [*FEW_STEPS, "compile=off"])
-    )
-    refine(kitti_copy, tmp_path, watched)
-    # The same for every call: neither the calls before nor an interruption change what is compiled.
-    assert counts == [5000, 5000]
-    assert compile_module._job.get() == 0
 
 
 def test_options_are_checked() -> None:

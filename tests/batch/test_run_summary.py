@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 import torch
 
-from directshape_torch.batch import run_summary
 from directshape_torch.batch.run_summary import (
     CallTiming,
     RunSummary,
@@ -31,8 +30,8 @@ def done(**statuses: int) -> dict[str, Any]:
 FAILED = {"state": "failed", "reason": "cut short"}
 
 
-def timings(forms: int = 0) -> RunTimings:
-    calls = [CallTiming(("000000",), 2, 0.3, forms), CallTiming(("000001", "000002"), 4, 0.6)]
+def timings() -> RunTimings:
+    calls = [CallTiming(("000000",), 2, 0.3), CallTiming(("000001", "000002"), 4, 0.6)]
     return RunTimings(torch.device("cpu"), calls)
 
 
@@ -61,28 +60,17 @@ def test_warnings(frames: dict[str, Any], expected: list[str]) -> None:
         assert warning.startswith(start)
 
 
-@pytest.mark.parametrize(("forms", "compiling"), [(0, ""), (3, " with compiling or loading code")])
-def test_report(forms: int, compiling: str) -> None:
+def test_report() -> None:
     frames = {"000000": done(converged=2), "000001": done(converged=3, no_mask=1), "000002": FAILED}
-    summary = RunSummary(frames, ("000000",), {"000002": "cut short"}, (), timings(forms))
+    summary = RunSummary(frames, ("000000",), {"000002": "cut short"}, (), timings())
     assert summary.exit_code == 1
     assert summary.num_cars == 6
     lines = format_summary(summary).splitlines()
     assert lines[0] == "frames   2 done, 1 of them in an earlier run, 1 failed"
     assert lines[1] == "cars     6: 5 refined (converged 5), 1 as before (no_mask 1)"
     # 0.9 s over 6 cars and 3 frames.
-    assert lines[2] == f"time     150 ms per car, 300 ms per frame (refinement only{compiling}, cpu)"
+    assert lines[2] == "time     150 ms per car, 300 ms per frame (refinement only, cpu)"
     assert lines[3].startswith("memory   ")
-
-
-def test_a_call_counts_what_was_compiled_in_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    forms = iter((5, 8, 8, 8))
-    monkeypatch.setattr(run_summary, "num_forms", lambda: next(forms))
-    run = RunTimings(torch.device("cpu"))
-    for frame in ("000000", "000001"):
-        with run.measure((frame,), 2):
-            pass
-    assert [call.compiled for call in run.calls] == [3, 0]
 
 
 def test_a_run_without_work_has_no_time() -> None:

@@ -111,7 +111,7 @@ def test_a_value_out_of_range_is_named(override: str, text: str) -> None:
 @pytest.mark.parametrize(
     ("make", "text"),
     [
-        (lambda: RefinerConfig(compile=True), "compile: expected one of auto, on, off, got True"),  # type: ignore[arg-type]
+        (lambda: RefinerConfig(compile=True), "compile: expected one of on, off, got True"),  # type: ignore[arg-type]
         (lambda: SamplingConfig(density="5 %"), "density: expected a finite number, above 0 and at most 1, got '5 %'"),  # type: ignore[arg-type]
         (
             lambda: dataclasses.replace(PriorConfig(), dimensions_sigma_m=(0.1, 0.0, 0.4)),

@@ -7,10 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-# PyTorch's documentation tells users to take these by these names.
-DOCUMENTED = {"torch._dynamo.maybe_mark_dynamic", "torch.utils._python_dispatch.TorchDispatchMode"}
-# `compile.py` says what this is for, and does without it where it is missing.
-OPTIONAL = {"torch._C"}
+# PyTorch's documentation tells users to take this by this name.
+DOCUMENTED = {"torch.utils._python_dispatch.TorchDispatchMode"}
 
 
 def names_of_torch(tree: ast.AST) -> Iterator[str]:
@@ -31,7 +29,6 @@ def is_private(name: str) -> bool:
 def test_private_names_of_pytorch_do_not_occur() -> None:
     files = [*(ROOT / "directshape_torch").rglob("*.py"), *(ROOT / "scripts").rglob("*.py")]
     found = {name for file in files for name in names_of_torch(ast.parse(file.read_text(encoding="utf-8")))}
-    allowed = DOCUMENTED | OPTIONAL
-    private = {name for name in found if is_private(name) and not any(each.startswith(name) for each in allowed)}
+    private = {name for name in found if is_private(name) and not any(each.startswith(name) for each in DOCUMENTED)}
     assert private == set()
-    assert allowed <= found
+    assert found >= DOCUMENTED

@@ -1,11 +1,11 @@
-"""Lengths of vectors, joined flags and cross products agree with PyTorch's own."""
+"""Lengths of vectors and joined flags agree with PyTorch's own."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 
-from directshape_torch.numerics.tensors import all_along, cross, length
+from directshape_torch.numerics.tensors import all_along, length
 
 
 @pytest.mark.parametrize("dim", [0, 1, -1])
@@ -26,11 +26,3 @@ def test_all_along_is_all(dim: int) -> None:
     assert torch.equal(together, flags.all(dim=dim))
     assert together.any()
     assert not together.all()
-
-
-@pytest.mark.parametrize("compiling", [False, True])
-def test_cross_is_the_cross_product(monkeypatch: pytest.MonkeyPatch, compiling: bool) -> None:
-    generator = torch.Generator().manual_seed(0)
-    left, right = torch.randn(2, 4, 5, 3, dtype=torch.float64, generator=generator)
-    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: compiling)
-    torch.testing.assert_close(cross(left, right), torch.linalg.cross(left, right), rtol=1e-14, atol=1e-14)

@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from directshape_torch.compile import compiling, with_varying
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.records import Dense
 from directshape_torch.numerics.tables import Chosen, Table, declared, of, take_rows
@@ -96,18 +95,6 @@ def test_rows_are_taken_by_their_numbers_in_any_order() -> None:
 def test_without_a_table_that_knows_the_cars_of_its_rows_nothing_is_taken() -> None:
     alone = Rowwise(torch.zeros(3, 5, 2))
     assert of(alone, CARS) is alone
-
-
-def test_what_a_table_keeps_beside_its_fields_stays_with_a_marked_copy() -> None:
-    class Plain(Table):
-        def __init__(self) -> None:
-            self.numbers = torch.zeros(3)
-
-    plain = Plain()
-    with torch.no_grad(), compiling("on"):
-        marked = with_varying(plain)
-    assert marked is not plain
-    assert marked.numbers is plain.numbers
 
 
 def test_types_that_only_a_type_checker_imports_are_named() -> None:

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.compiled_lookup import graphs, trace_only
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import DEFAULT
 from helpers.street_inputs import SETTLED, summary, with_mode
@@ -241,28 +240,6 @@ def test_two_views_of_a_track_in_one_frame_are_refused() -> None:
     _, detections, _ = drive()
     with pytest.raises(InputError, match="track 5 in rows 0 and 1 of frame 0"):
         replace(detections, track_id=torch.tensor([5, 5, 1, 1, 2, 3]))
-
-
-@pytest.mark.usefixtures("fresh_compiler_counts")
-def test_a_track_that_a_compiler_traces_ends_where_a_plain_one_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the compiler makes of the traced code is `test_compiled_values`' matter."""
-    trace_only(monkeypatch, "eager")
-    config = replace(DEFAULT, stages=(StageConfig(1.0, 0, 3),))
-    frames, detections, _ = drive()
-    frames = replace(frames, time_s=torch.tensor([0.0, 0.1, 0.2], dtype=torch.float64)).to(dtype=torch.float32)
-    track = replace(select(detections, torch.tensor([0, 2, 4])), track_id=torch.zeros(3, dtype=torch.long))
-    plain, traced = (
-        DirectShapeRefiner(ellipsoid_prior(torch.float32), replace(config, compile=compile))(
-            frames, track.to(dtype=torch.float32)
-        )
-        for compile in ("off", "on")
-    )
-    assert graphs() >= 4
-    assert "path" in traced.term_names
-    # The third view, whose box was nearly right, costs more than its input with the shape of all.
-    assert traced.track_part.tolist() == plain.track_part.tolist() == [0, 0, -1]
-    torch.testing.assert_close(traced.T_cam_obj, plain.T_cam_obj, rtol=0, atol=0.02)
-    torch.testing.assert_close(traced.code, plain.code, rtol=0, atol=0.1)
 
 
 @pytest.mark.parametrize(
