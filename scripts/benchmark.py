@@ -5,8 +5,7 @@
     python scripts/benchmark.py --native                         # with native loops over without them
     python scripts/benchmark.py --against ../other_checkout      # times and operations of this version over another's
 
-Frames come from DIRECTSHAPE_DATA (or --data), else from the bundled demo frame. A graphics card is used if there is
-one; then its agreement with the CPU is measured too.
+Frames come from DIRECTSHAPE_DATA (or --data), else from the bundled demo frame. `on_a_gpu.py` measures a graphics card.
 """
 
 from __future__ import annotations
@@ -18,13 +17,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from benchmark_suites.times import device_rows, time_rows
+from benchmark_suites.times import time_rows
 from benchmark_suites.timing import Row
 from benchmark_suites.workloads import load_scenes
 from command_line import run_command
 
 from directshape_torch.batch.refine_dataset import package_version
-from directshape_torch.cli.options import find_device
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.tables import align
 
@@ -35,7 +33,7 @@ def run(args: argparse.Namespace) -> None:
     """Measure and print.
 
     Raises:
-        InputError: the data, device or checkout does not exist.
+        InputError: the data or checkout does not exist.
     """
     if args.threads is not None:
         if args.threads < 1:
@@ -43,8 +41,7 @@ def run(args: argparse.Namespace) -> None:
         torch.set_num_threads(args.threads)
     data = args.data or os.environ.get("DIRECTSHAPE_DATA")
     root = Path(data) if data else None
-    device = find_device(args.device)
-    print(machine(device), flush=True)
+    print(machine(torch.device("cpu")), flush=True)
     rounds = 1 if args.quick else _ROUNDS
     if args.profile:
         from benchmark_suites.stage_profile import profile_rows
@@ -60,9 +57,7 @@ def run(args: argparse.Namespace) -> None:
         show(list(native_rows(root, args.quick)))
     if not (args.profile or args.native or args.against):
         scenes = load_scenes(root, 1 if args.quick else None)
-        show([row for scene in scenes for row in time_rows(scene, device, rounds, args.quick)])
-        if device.type != "cpu":
-            show(device_rows(scenes, device))
+        show([row for scene in scenes for row in time_rows(scene, rounds, args.quick)])
 
 
 def show(rows: Sequence[Row]) -> None:
@@ -71,11 +66,17 @@ def show(rows: Sequence[Row]) -> None:
 
 
 def machine(device: torch.device) -> str:
-    """The machine and the versions, in one line."""
+    """The machine and the versions, in one line.
+
+    Args:
+        device: the processor, or the graphics card whose name is wanted.
+    """
     listing = Path("/proc/cpuinfo")  # Linux hides the model's name from `platform`
     lines = listing.read_text(encoding="utf-8").splitlines() if listing.is_file() else []
     names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    name = next(names, platform.processor()) if device.type == "cpu" else torch.cuda.get_device_name(device)
+    name = next(names, platform.processor())
+    if device.type != "cpu":
+        name = f"{torch.cuda.get_device_name(device) if device.type == 'cuda' else device}, {name}"
     load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
     versions = f"Python {platform.python_version()}, PyTorch {torch.__version__}, directshape_torch {package_version()}"
     return f"{name}, {os.cpu_count()} cores{load}, {torch.get_num_threads()} threads of PyTorch; {versions}"
@@ -88,7 +89,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--native", action="store_true", help="with native loops over without them, in turn")
     parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="this version over another one, in turn")
     parser.add_argument("--data", type=Path, metavar="ROOT", help="default: DIRECTSHAPE_DATA")
-    parser.add_argument("--device", default="auto", help="cpu, cuda ..; default: cuda where there is one")
     parser.add_argument("--quick", action="store_true", help="see that everything runs; no figures to quote")
     parser.add_argument("--threads", type=int, metavar="N", help="of PyTorch; default: its own choice")
     return run_command(parser, run, arguments)

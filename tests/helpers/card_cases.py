@@ -18,6 +18,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+import on_a_gpu
 import torch
 from torch import Tensor
 
@@ -203,6 +204,14 @@ def demo() -> dict[str, list[str]]:
     return {"names": names, "differ": [*differ, *missing]}
 
 
+def page() -> str:
+    """The page of `scripts/on_a_gpu.py`."""
+    with tempfile.TemporaryDirectory() as folder, without_kernels():
+        file = Path(folder) / "gpu.md"
+        assert on_a_gpu.main(["--device", "card", "--quick", "--out", str(file)]) == 0
+        return file.read_text()
+
+
 CASES: dict[str, Callable[[], Any]] = {
     **{name: lambda config=config: compare(config) for name, config in SETTINGS.items()},  # type: ignore[misc]
     "neural prior, other residuals and priors, every step": lambda: compare(OTHER_FORMS, prior_of("neural")),
@@ -212,6 +221,7 @@ CASES: dict[str, Callable[[], Any]] = {
     "waits of masks": waits_of_masks,
     "the card itself": waits_of_nothing,
     "demo": demo,
+    "page": page,
 }
 
 

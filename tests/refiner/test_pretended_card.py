@@ -35,7 +35,7 @@ _COMPARED = [
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The results of `helpers.card_cases`, computed once in a separate process, to which the device belongs."""
     file = tmp_path_factory.mktemp("card") / "found.json"
-    paths = [str(_TESTS), str(_TESTS.parent), os.environ.get("PYTHONPATH", "")]
+    paths = [str(_TESTS), str(_TESTS.parent), str(_TESTS.parent / "scripts"), os.environ.get("PYTHONPATH", "")]
     done = subprocess.run(
         [sys.executable, "-m", "helpers.card_cases", str(file)],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), "OMP_NUM_THREADS": "1"},
@@ -92,6 +92,16 @@ def test_the_demo_writes_the_same_files(found: dict[str, Any]) -> None:
     assert len(demo["names"]) > 5
     # These name the device, and what it took.
     assert demo["differ"] == ["run.jsonl", "timings.json"]
+
+
+def test_the_page_for_a_card_has_results_gradients_and_times(found: dict[str, Any]) -> None:
+    assert not isinstance(found["page"], dict), found["page"]["error"]
+    rows = dict(line.strip("| ").split(" | ") for line in found["page"].splitlines() if line.startswith("| "))
+    for name in ("given boxes", "masks alone"):
+        assert rows[f"{name}: cars with the CPU's status"] == "6 of 6"
+        assert rows[f"{name}: median distance from the CPU's place"] == "0 mm"
+    assert rows["unrolled gradient by the right image: distance from the CPU's, over its size"] == "0"
+    assert rows["1 frames, 6 cars, eager: time"].endswith("ms a car")
 
 
 def test_tensors_of_both_devices_do_not_mix_and_waits_are_noted(found: dict[str, Any]) -> None:

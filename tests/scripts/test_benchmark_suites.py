@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import benchmark
 import pytest
 import torch
-from benchmark_suites import checkouts, native_loops, stage_profile, times
+from benchmark_suites import checkouts, native_loops, stage_profile
 from benchmark_suites.measures import count_operations, peak_tensor_bytes
 from benchmark_suites.stage_profile import PARTS, profile_parts
 from benchmark_suites.timing import Row, Spread, time_interleaved
-from benchmark_suites.workloads import demo_scene
-from helpers.car_counts import first_cars
 
 from directshape_torch.kernels.choice import without_kernels
 
@@ -73,22 +70,13 @@ def test_each_side_is_timed_by_itself_in_an_order_that_turns_round(monkeypatch: 
 
 def test_times_are_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.delenv("DIRECTSHAPE_DATA", raising=False)
-    assert benchmark.main(["--quick", "--device", "cpu"]) == 0
+    assert benchmark.main(["--quick"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert f"PyTorch {torch.__version__}" in lines[0]
     (a_call,) = (line for line in lines if line.startswith("demo, 1 frame in a call, default, eager: ms a call"))
     operations, memory = a_call.split("  ")[-1].split(", ")[:2]
     assert int(operations.split()[0]) > 10_000
     assert 0 < float(memory.split()[0]) < 100
-
-
-def test_a_device_is_compared_with_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The CPU stands in for the card: it agrees with itself."""
-    refiner = times.make_refiner("fast", False, "stages=[{max_iterations: 1}]")
-    monkeypatch.setattr(times, "make_refiner", lambda *_: refiner)
-    scene = replace(demo_scene(), frames=(first_cars(demo_scene().frames[0], 1),))
-    (share,) = times.device_rows([scene], torch.device("cpu"))
-    assert share.spread.median == 1.0
 
 
 @pytest.mark.parametrize(
