@@ -5,9 +5,8 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from functools import partial, wraps
-from typing import Any, NamedTuple, ParamSpec, TypeGuard, TypeVar
+from typing import Any, ParamSpec, TypeGuard, TypeVar
 
 import torch
 from torch import Tensor
@@ -23,63 +22,48 @@ _FULL = ("none", "ieee")
 _PRODUCTS = (torch.backends.cuda.matmul, torch.backends.mkldnn.matmul)  # type: ignore[attr-defined]
 
 
-class _Setting(NamedTuple):
-    """A `_Setting` says which precisions of matrix products the user has allowed."""
+def _suspend() -> Callable[[], None]:
+    """Ask for all digits, by the names that the user uses; the returned function allows again what was allowed."""
+    try:
+        by_old_name = torch.get_float32_matmul_precision()
+    except RuntimeError:  # the newer names are in use, and both together are refused
+        by_old_name = "highest"
+    if by_old_name != "highest":
+        torch.set_float32_matmul_precision("highest")
+        return partial(torch.set_float32_matmul_precision, by_old_name)
+    allowed = [(products, products.fp32_precision) for products in _PRODUCTS]
+    fewer = [(products, value) for products, value in allowed if value not in _FULL]
+    for products, _ in fewer:
+        products.fp32_precision = "ieee"
 
-    by_old_name: str | None  # value of `torch.set_float32_matmul_precision`; None where the newer names are in use
-    asked: tuple[str, ...]  # `fp32_precision` of each of `_PRODUCTS`
+    def restore() -> None:
+        for products, value in fewer:
+            # "none" comes first, so that a value from `torch.backends.fp32_precision` goes on following it.
+            products.fp32_precision = "none"
+            if products.fp32_precision != value:
+                products.fp32_precision = value
 
-    @classmethod
-    def now(cls) -> _Setting:
-        try:
-            by_old_name = torch.get_float32_matmul_precision()
-        except RuntimeError:  # the newer names are in use, and both together are refused
-            by_old_name = None
-        return cls(by_old_name, tuple(products.fp32_precision for products in _PRODUCTS))
-
-    def suspend(self) -> None:
-        """Ask for all digits, by the names that the user uses."""
-        if self.by_old_name not in (None, "highest"):
-            torch.set_float32_matmul_precision("highest")
-            return
-        for products, value in zip(_PRODUCTS, self.asked, strict=True):
-            if value not in _FULL:
-                products.fp32_precision = "ieee"
-
-    def restore(self) -> None:
-        """Allow again what was allowed before `suspend`."""
-        if self.by_old_name not in (None, "highest"):
-            torch.set_float32_matmul_precision(self.by_old_name)
-            return
-        for products, value in zip(_PRODUCTS, self.asked, strict=True):
-            if value not in _FULL:
-                # "none" comes first, so that a value from `torch.backends.fp32_precision` goes on following it.
-                products.fp32_precision = "none"
-                if products.fp32_precision != value:
-                    products.fp32_precision = value
+    return restore
 
 
-@dataclass
 class _Regions:
     """`_Regions` counts regions of all threads; the first entry and the last exit change the process's setting."""
 
-    lock: threading.Lock = field(default_factory=threading.Lock)
-    inside: int = 0
-    before: _Setting | None = None
+    def __init__(self) -> None:
+        self.lock, self.inside = threading.Lock(), 0
+        self.restore: Callable[[], None] | None = None
 
     def enter(self) -> None:
         with self.lock:
-            if self.before is None:
-                self.before = _Setting.now()
-                self.before.suspend()
+            self.restore = self.restore or _suspend()
             self.inside += 1
 
     def leave(self) -> None:
         with self.lock:
             self.inside -= 1
-            if self.inside == 0 and self.before is not None:
-                self.before.restore()
-                self.before = None
+            if self.inside == 0 and self.restore is not None:
+                self.restore()
+                self.restore = None
 
 
 _regions = _Regions()
