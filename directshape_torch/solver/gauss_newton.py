@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Generic
+from itertools import groupby
+from typing import Annotated, Generic, TypeAlias
 
 import torch
 from torch import Tensor
@@ -62,58 +63,8 @@ class Minimum(Generic[StateT, PreparedT, EvaluationT, FiguresT]):
     trajectory: tuple[Iteration[StateT], ...] = ()  # all iterations in order, if they were asked for
 
 
-class _Log(Generic[StateT]):
-    """A `_Log` keeps the iterations of one stage: rows of a compacted batch are put in their places block by block."""
-
-    def __init__(
-        self,
-        history: list[Tensor],
-        trajectory: list[Iteration[StateT]] | None,
-        stage: int,
-        all_states: StateT,
-        over_relaxation: float,
-    ) -> None:
-        self.history, self.trajectory, self.stage, self.all_states = history, trajectory, stage, all_states
-        self.over_relaxation = over_relaxation
-        self.costs: list[Tensor] = []
-        self.running: list[Tensor] = []
-
-    def add(
-        self,
-        rows: Tensor,
-        before: tuple[StateT, Tensor, Tensor],
-        outcome: tuple[Tensor, Tensor, Tensor],
-        cost: Tensor,
-    ) -> None:
-        """Add one iteration of `rows`: state, damping and stretched steps before it, then what came of it, and cost."""
-        running, accepted, improved = outcome
-        self.costs.append(cost)
-        self.running.append(running)
-        if self.trajectory is None:
-            return
-        state, damping, stretched = before
-        zeros = cost.new_zeros(len(self.all_states[0]))
-        none = torch.zeros_like(zeros, dtype=torch.bool)
-        self.trajectory.append(
-            Iteration(
-                self.stage,
-                put_rows(self.all_states, rows, state),
-                zeros.index_copy(0, rows, damping),
-                zeros.index_copy(0, rows, step_lengths(stretched, self.over_relaxation).to(damping.dtype)),
-                none.index_copy(0, rows, accepted),
-                none.index_copy(0, rows, improved),
-            )
-        )
-
-    def end_block(self, rows: Tensor) -> None:
-        """Write the costs of a block into columns (B, iterations) of all problems."""
-        if not self.costs:
-            return
-        # Problems that have ended stay in the batch until it is worth leaving them out.
-        columns = torch.where(torch.stack(self.running, dim=1), torch.stack(self.costs, dim=1), torch.nan)
-        nan = columns.new_full((len(self.all_states[0]), len(self.costs)), torch.nan)
-        self.history.append(nan.index_copy(0, rows, columns))
-        self.costs, self.running = [], []
+_CostOfRows: TypeAlias = tuple[Tensor, Tensor, Tensor]
+"""These are the problems (R,) of an iteration, whether each took part, and their costs after it."""
 
 
 @full_precision()
@@ -144,15 +95,14 @@ def minimise(
         ended = torch.full((num_problems,), RUNNING, device=initial[0].device)
         iterations = torch.zeros_like(ended)
         unfailed = Chosen(ended < 0, range(num_problems))
-        history: list[Tensor] = []
+        costs: list[_CostOfRows] = []
         starts: list[StateT] = []
         trajectory: list[Iteration[StateT]] | None = [] if record else None
         for number, config_of_stage in enumerate(problem.stages()):
             stage = problem.begin(number, prepared)
             starts.append(state)
-            log = _Log(history, trajectory, len(starts) - 1, state, config_of_stage.over_relaxation)
             state, ended, done, unfailed = _run_stage(
-                stage, config_of_stage, state, prepared, ended, unfailed, config, log
+                stage, config_of_stage, state, prepared, ended, unfailed, config, costs, trajectory, number
             )
             iterations = iterations + done
             prepared = problem.prepare(state)
@@ -161,13 +111,12 @@ def minimise(
         status = torch.where(ended < 0, Status.max_iterations.code, ended)
         worse = ~(after.cost <= before.cost)
         status = torch.where(worse & ~has_failed(ended), Status.rejected_worse.code, status)
-        nothing = torch.empty(num_problems, 0, device=initial[0].device)
         return Minimum(
             state=where_rows(is_refined(status), state, initial),
             end=state,
             status=status,
             iterations=iterations,
-            cost_history=torch.cat(history, dim=1) if history else nothing,
+            cost_history=_history(costs, torch.empty(num_problems, 0, device=initial[0].device)),
             stage_starts=tuple(starts),
             stage=stage,
             prepared_end=prepared,
@@ -185,13 +134,19 @@ def _run_stage(
     ended: Tensor,
     unfailed: Chosen,
     config: SolverConfig,
-    log: _Log[StateT],
+    costs: list[_CostOfRows],
+    trajectory: list[Iteration[StateT]] | None,
+    number: int,
 ) -> tuple[StateT, Tensor, Tensor, Chosen]:
-    """States, ends and iterations of all problems after a stage, and those that had not failed when the host looked."""
+    """States, ends and iterations of all problems after a stage, and those that had not failed when the host looked.
+
+    Each iteration is added to `costs` and, if there is one, to the trajectory, with the `number` of the stage.
+    """
     iterations = torch.zeros_like(ended)
     numbers: Sequence[int] = unfailed.numbers
     if not numbers:
         return state, ended, iterations, unfailed
+    begun_at = state
     part, at_state = begun.start(prepared)
     progress = begin(state, at_state, ended, config)
     rows = torch.arange(len(ended), device=ended.device)
@@ -203,11 +158,16 @@ def _run_stage(
     done = 0
     while done < stage.max_iterations:
         for _ in range(min(config.block_iterations, stage.max_iterations - done)):
-            before = (progress.state, progress.damping, progress.stretched)
-            outcome = iterate(part, progress, config, limits, stage.over_relaxation)
-            log.add(rows, before, outcome, progress.at_state.cost)
+            before, damping, stretched = progress.state, progress.damping, progress.stretched
+            running, accepted, improved = iterate(part, progress, config, limits, stage.over_relaxation)
+            costs.append((rows, running, progress.at_state.cost))
+            if trajectory is not None:
+                lengths = step_lengths(stretched, stage.over_relaxation).to(damping.dtype)
+                zeros, none = (damping.new_zeros(len(ended), dtype=x.dtype) for x in (damping, accepted))
+                of_rows = zip((zeros, zeros, none, none), (damping, lengths, accepted, improved), strict=True)
+                of_all = (nothing.index_copy(0, rows, of_row) for nothing, of_row in of_rows)
+                trajectory.append(Iteration(number, put_rows(begun_at, rows, before), *of_all))
             done += 1
-        log.end_block(rows)
         codes = _read(progress.ended)
         failed |= {n for n, code in zip(numbers, codes, strict=True) if code not in (RUNNING, Status.converged.code)}
         places = [place for place, code in enumerate(codes) if code < 0]
@@ -223,6 +183,18 @@ def _run_stage(
     if done:
         unfailed = Chosen(~has_failed(ended), [number for number in unfailed.numbers if number not in failed])
     return state, ended, iterations, unfailed
+
+
+def _history(costs: list[_CostOfRows], nothing: Tensor) -> Tensor:
+    """The costs in columns (B, iterations), after `nothing` (B, 0), with NaN where a problem took no part."""
+    columns = [nothing]
+    # Problems that have ended stay in the batch until it is worth leaving them out, so most rows are the same.
+    for _, alike in groupby(costs, key=lambda each: id(each[0])):
+        rows, running, cost = zip(*alike, strict=True)
+        of_rows = torch.where(torch.stack(running, dim=1), torch.stack(cost, dim=1), torch.nan)
+        nan = of_rows.new_full((len(nothing), len(cost)), torch.nan)
+        columns.append(nan.index_copy(0, rows[0], of_rows))
+    return torch.cat(columns[1:] or columns, dim=1)
 
 
 def _read(ended: Tensor) -> list[int]:
