@@ -20,6 +20,8 @@ Unknowns = Literal["both", "pose", "shape"]
 """A stage moves these unknowns."""
 SamplingMode = Literal["adaptive", "uniform", "dense"]
 """The mode says which pixels of its region a car gets."""
+OcclusionOrder = Literal["depth", "box_bottom"]
+"""The order says which of two instances is in front."""
 
 _T = TypeVar("_T")
 _COMPARISONS = {"above": operator.gt, "at_least": operator.ge, "at_most": operator.le}
@@ -311,7 +313,7 @@ class SamplingConfig(Settings):
     density: float = setting(0.05, "wanted pixels per pixel of the region", above=0, at_most=1)
     min_pixels: int = setting(400, "fewest wanted pixels; a region of fewer gives all it has", at_least=1)
     max_pixels: int = setting(1000, "most wanted pixels", at_least="min_pixels")
-    occlusion_order: Literal["depth", "box_bottom"] = setting(
+    occlusion_order: OcclusionOrder = setting(  # noqa: RUF009
         "depth", 'which instance is nearer: by "depth" (default) or "box_bottom" (the paper)'
     )
     min_usable_pixels: int = setting(20, "cars with fewer pixels get the status too_few_pixels", at_least=0)

@@ -10,18 +10,18 @@ the least number of the instances that cover each pixel, therefore tells what hi
 from __future__ import annotations
 
 import math
-from typing import Literal
 
 import torch
 from torch import Tensor
 
+from directshape_torch.config import OcclusionOrder
 from directshape_torch.rows import OcclusionMap
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import Side
 from directshape_torch.scene.masks import MASK_THRESHOLD, MaskCrops
 
 
-def occlusion_map(detections: Detections, side: Side, order: Literal["depth", "box_bottom"] = "depth") -> OcclusionMap:
+def occlusion_map(detections: Detections, side: Side, order: OcclusionOrder = "depth") -> OcclusionMap:
     """The map of what hides the B objects in one image.
 
     Args:

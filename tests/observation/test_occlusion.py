@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
 
 import pytest
 import torch
 from reference.occlusion import hidden_pixels as one_by_one
 from torch import Tensor
 
+from directshape_torch.config import OcclusionOrder
 from directshape_torch.observation.occlusion import occlusion_map
 from directshape_torch.scene.detections import Detections, Occluders
 from directshape_torch.scene.frames import Side
@@ -61,7 +61,7 @@ def hidden_pixels(detections: Detections, side: Side, object_index: Tensor, uv: 
     return hidden
 
 
-def instances_in_front(detections: Detections, side: Side, order: Literal["depth", "box_bottom"] = "depth") -> Tensor:
+def instances_in_front(detections: Detections, side: Side, order: OcclusionOrder = "depth") -> Tensor:
     """Which instance hides which detection (B + M, B), from masks in which each covers a pixel of its own."""
     others, count = detections.occluders, len(detections)
     num_instances = count + (0 if others is None else len(others.frame_index))

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from directshape_torch.observation.occlusion import OcclusionOrder
+from directshape_torch.config import OcclusionOrder
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import Side
 from directshape_torch.scene.masks import MASK_THRESHOLD
