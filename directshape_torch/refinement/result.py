@@ -167,8 +167,8 @@ class RefinementResult(CarRecord):
 
     def numpy(self) -> dict[str, NDArray[Any]]:
         """All tensors as arrays by the names of `state_dict`, boxes in the reference frame, and arrays of words."""
-        boxes = self.boxes()
-        tensors = {**self.detach().cpu().state_dict(), **{f"boxes.{name}": x for name, x in vars(boxes).items()}}
+        boxes = {f"boxes.{name}": x for name, x in vars(self.boxes()).items()}
+        tensors = {**self.detach().cpu().state_dict(), **boxes}
         words = {
             "status": [status.name for status in self.status],
             "term_names": list(self.term_names),
@@ -206,25 +206,24 @@ class RefinementResult(CarRecord):
         first.
         """
         lines = [f"RefinementResult of {len(self)} cars ({self.T_cam_obj.dtype}, {self.T_cam_obj.device})"]
-        counts = Counter(self.status).most_common()
-        lines.append(f"  {counted(Counter(status.name for status in self.status)) if len(self) else 'no cars'}")
-        lines += [f"  {status.name}: {status.value}" for status, _ in counts if not status.is_refined]
         if not len(self):
-            return lines[0] + "\n" + lines[1]
+            return f"{lines[0]}\n  no cars"
+        counts = Counter(self.status)
+        lines.append(f"  {counted({status.name: count for status, count in counts.items()})}")
+        lines += [f"  {status.name}: {status.value}" for status, _ in counts.most_common() if not status.is_refined]
         shown, left_out = self._printed_rows()
         lines.append("  car      x      y      z  heading  length  mask IoU  better  not worse  status")
         chosen = self.detach()[shown].cpu()
         boxes, quality = chosen.to_boxes("kitti").tolist(), chosen.quality
-        senses: list[str] = []
-        for place, (row, (x, y, z, _, _, length, heading)) in enumerate(zip(shown.tolist(), boxes, strict=True)):
-            figures = quality.mask_iou_left, quality.probability_better, quality.probability_not_worse
-            iou, better, not_worse = (float(figure[place]) for figure in figures)
-            senses.append(" " if is_front_known(float(quality.probability_heading[place])) else "?")
+        is_known = [is_front_known(probability) for probability in quality.probability_heading.tolist()]
+        figures = (quality.mask_iou_left, quality.probability_better, quality.probability_not_worse)
+        columns = shown.tolist(), boxes, is_known, chosen.status, *(figure.tolist() for figure in figures)
+        for row, (x, y, z, _, _, length, heading), known, status, iou, better, not_worse in zip(*columns, strict=True):
             lines.append(
-                f"  {row:3d} {x:6.2f} {y:6.2f} {z:6.2f} {heading:8.2f}{senses[-1]}{length:7.2f} {iou:9.2f} "
-                f"{better:7.2f} {not_worse:10.2f}  {chosen.status[place].name}"
+                f"  {row:3d} {x:6.2f} {y:6.2f} {z:6.2f} {heading:8.2f}{' ' if known else '?'}{length:7.2f} {iou:9.2f} "
+                f"{better:7.2f} {not_worse:10.2f}  {status.name}"
             )
-        if "?" in senses:
+        if not all(is_known):
             lines.append("  ? either end may be the front (quality.probability_heading)")
         return "\n".join(lines + left_out)
 
@@ -386,17 +385,14 @@ def _chosen_rows(index: object, count: int) -> Tensor:
     """Numbers of the cars that an index selects by the rules of NumPy."""
     try:
         given = index.detach().cpu().numpy() if isinstance(index, Tensor) else index
-        rows = np.atleast_1d(np.arange(count)[given])  # type: ignore[call-overload]
+        # PyTorch does not support negative strides.
+        rows = torch.from_numpy(np.atleast_1d(np.arange(count)[given]).copy())  # type: ignore[call-overload]
+        if rows.ndim > 1:
+            raise IndexError("an index with several axes")
     except (IndexError, TypeError, ValueError, RuntimeError) as error:
-        raise InputError("index", _cars_in_words(count), shown(index)) from error
-    if rows.ndim > 1:
-        raise InputError("index", _cars_in_words(count), shown(index))
-    # PyTorch does not support negative strides.
-    return torch.from_numpy(rows.copy())
-
-
-def _cars_in_words(count: int) -> str:
-    return f"a slice, {count} booleans, or cars of 0..{count - 1}" if count else "a slice, for there is no car"
+        words = f"a slice, {count} booleans, or cars of 0..{count - 1}" if count else "a slice, for there is no car"
+        raise InputError("index", words, shown(index)) from error
+    return rows
 
 
 def _moved_prior(prior: ShapePrior, like: Tensor) -> ShapePrior:
