@@ -47,7 +47,8 @@ from directshape_torch.terms.photometric import Photometric, Surface
 SETTINGS = load_config(
     None,
     [
-        *("compile=off", "silhouette.weight=0", "rig.disparity_sigma_px=0"),
+        "silhouette.weight=0",
+        "rig.disparity_sigma_px=0",
         *(f"priors.{name}_weight=0" for name in ("shape", "height", "tilt", "dimensions", "pose")),
     ],
 )

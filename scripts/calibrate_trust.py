@@ -248,7 +248,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--workers", type=int, default=2, help="processes")
-    parser.add_argument("--set", nargs="+", default=["compile=off"], metavar="KEY=VALUE", help="other settings")
+    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="other settings")
     return run_command(parser, run, arguments)
 
 

@@ -122,7 +122,7 @@ def fit_shape(
 
 def _fitter(prior: ShapePrior | None, samples: PointSamples) -> DirectShapeRefiner:
     """A refiner whose terms are the points and the priors."""
-    plain = RefinerConfig(compile="off", check="off", rig=RigConfig(0.0))
+    plain = RefinerConfig(check="off", rig=RigConfig(0.0))
     # The fit uses neither images nor a detector.
     config = replace(
         plain,

@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     check_folder("out", args.out)
     dataset = _dataset(args)
     # Compiling does not pay for one frame, and pictures need no graphics card.
-    refiner = make_refiner(args.config, ["compile=off", *args.set], args.prior, "cpu")
+    refiner = make_refiner(args.config, args.set, args.prior, "cpu")
     refiner.rig = RigEstimates(known_rigs(args.rig))
     if args.tracks:
         if not inspect_tracks([dataset.load(frame_id) for frame_id in dataset.frame_ids], refiner, args.out):

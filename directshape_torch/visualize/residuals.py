@@ -123,7 +123,6 @@ def residual_maps(
         silhouette=replace(config.silhouette, weight=1.0),
         photometric=replace(config.photometric, weight=1.0),
         point_cloud=replace(config.point_cloud, weight=0.0),
-        compile="off",
         sampling=sampling,
     )
     frame, detections = loaded.frame, loaded.detections

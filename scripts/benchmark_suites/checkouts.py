@@ -6,15 +6,13 @@ refiner.
 
     PYTHONPATH=CHECKOUT:scripts python -m benchmark_suites.checkouts
 
-This command runs one such process. It prints its scenes and then answers each line `MODE SCENE FIRST COUNT`, a call of
-COUNT frames with `compile` on or off, with the seconds of the call, or with its operations if the line ends in
-`operations`.
+This command runs one such process. It prints its scenes and then answers each line `SCENE FIRST COUNT`, a call of COUNT
+frames, with the seconds of the call, or with its operations if the line ends in `operations`.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import os
 import subprocess
@@ -22,7 +20,6 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -32,7 +29,7 @@ import torch
 from benchmark_suites.measures import count_operations
 from benchmark_suites.timing import Row, Spread
 from benchmark_suites.workloads import load_scenes
-from directshape_torch import DirectShapeRefiner, load_config
+from directshape_torch import DirectShapeRefiner
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.io.frame_collation import collate
 
@@ -58,14 +55,11 @@ def against_rows(checkout: Path, data_root: Path | None, quick: bool = False) ->
             calls = {f"{scene}, one frame in a call": [(f, 1) for f in range(min(count, _SINGLE_FRAMES))]}
             if not quick:
                 calls[f"{scene}, {_BATCH_FRAMES} frames in a call"] = [(0, _BATCH_FRAMES)]
-            for mode, (what, frames) in itertools.product(("off",) if quick else ("off", "on"), calls.items()):
-                what = f"{what}, {'compiled' if mode == 'on' else 'eager'}"
-                asked = [f"{mode} {number} {first} {size}" for first, size in frames]
+            for what, frames in calls.items():
+                asked = [f"{number} {first} {size}" for first, size in frames]
                 seconds = [pair for line in asked for pair in _seconds(ours, theirs, line, rounds)]
                 note = " over ".join(f"{1e3 * median(side):.0f} ms" for side in zip(*seconds, strict=True))
                 yield Row(f"{what}, time", Spread.of([a / b for a, b in seconds]), note)
-                if mode == "on":
-                    continue
                 found = [[version.ask(f"{line} operations") for line in asked] for version in (ours, theirs)]
                 note = f"{' '.join(map(str, found[0]))} over {' '.join(map(str, found[1]))}"
                 yield Row(f"{what}, operations", Spread.of([a / b for a, b in zip(*found, strict=True)]), note)
@@ -122,18 +116,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parser.parse_args(arguments)
     torch.set_num_threads(args.threads)
     scenes = load_scenes(args.data, _BATCH_FRAMES)
-    refiner = cache(lambda mode: DirectShapeRefiner(config=load_config("default", [f"compile={mode}"])))
+    refiner = DirectShapeRefiner()
     print(json.dumps([(scene.name, len(scene.frames)) for scene in scenes]), flush=True)
     for line in sys.stdin:
-        mode, number, first, count, *operations = line.split()
+        number, first, count, *operations = line.split()
         frames = scenes[int(number)].frames
         inputs = collate([frames[n % len(frames)] for n in range(int(first), int(first) + int(count))])
-        refine = refiner(mode)
         if operations:
-            print(count_operations(lambda: refine(*inputs)), flush=True)  # noqa: B023
+            print(count_operations(lambda: refiner(*inputs)), flush=True)  # noqa: B023
             continue
         start = time.process_time()
-        refine(*inputs)
+        refiner(*inputs)
         print(time.process_time() - start, flush=True)
 
 

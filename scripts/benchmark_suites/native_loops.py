@@ -1,4 +1,4 @@
-"""This module runs `--native`: refinements with native loops over refinements without them, in one process.
+"""This module runs `--native` and `--compiled`: refinements one way over refinements another way, in one process.
 
 The calls are made in turn, and processor time is compared, so that other load on the machine slows down both.
 """
@@ -6,35 +6,60 @@ The calls are made in turn, and processor time is compared, so that other load o
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import median
 
 import torch
 
+from benchmark_suites.times import on_device
 from benchmark_suites.timing import Row, Spread
 from benchmark_suites.workloads import load_scenes
-from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, RefinementResult
+from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, RefinementResult, load_config
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.kernels.choice import without_kernels
 
 _SINGLE_FRAMES, _BATCH_FRAMES, _ROUNDS = 3, 8, 7
 _SCENES = "rendered", "kitti", "kitti15"
 _NEAR_M = 1e-3
+_CPU = torch.device("cpu")
+
+
+_Inputs = tuple[FrameBatch, Detections]
+_Refine = Callable[[FrameBatch, Detections], RefinementResult]
 
 
 def native_rows(data_root: Path | None, quick: bool = False) -> Iterator[Row]:
-    """Ratios of processor time for single frames and for 8 in a call, and how far apart cars end."""
+    """With native loops over without them."""
     refiner = DirectShapeRefiner()
+
+    def by_tensor_operations(frames: FrameBatch, detections: Detections) -> RefinementResult:
+        with without_kernels():
+            result: RefinementResult = refiner(frames, detections)
+        return result
+
+    return _rows(data_root, quick, refiner, by_tensor_operations)
+
+
+def compiled_rows(data_root: Path | None, device: torch.device, quick: bool = False) -> Iterator[Row]:
+    """With `compile: on` over off, both with native loops where there are any."""
+    on, off = (DirectShapeRefiner(config=load_config(None, [f"compile={mode}"])).to(device) for mode in ("on", "off"))
+    return _rows(data_root, quick, on, off, device)
+
+
+def _rows(
+    data_root: Path | None, quick: bool, one: _Refine, other: _Refine, device: torch.device = _CPU
+) -> Iterator[Row]:
+    """Ratios of processor time for single frames and for 8 in a call, and how far apart cars end."""
     for scene in load_scenes(data_root, _BATCH_FRAMES, _SCENES):
         single = range(1 if quick else min(len(scene.frames), _SINGLE_FRAMES))
         calls = {"one frame in a call": [collate(scene.frames[n : n + 1]) for n in single]}
         if not quick:
             calls[f"{len(scene.frames)} frames in a call"] = [collate(scene.frames)]
         for what, inputs in calls.items():
-            compared = [pair for each in inputs for pair in _pairs(refiner, each, 1 if quick else _ROUNDS)]
-            seconds = [(native[0], plain[0]) for native, plain in compared]
+            inputs = [on_device(*each, device) for each in inputs]
+            compared = [pair for each in inputs for pair in _pairs(one, other, each, 1 if quick else _ROUNDS)]
+            seconds = [(mine[0], others[0]) for mine, others in compared]
             note = " over ".join(f"{1e3 * median(side):.0f} ms" for side in zip(*seconds, strict=True))
             yield Row(f"{scene.name}, {what}, time", Spread.of([a / b for a, b in seconds]), note)
             # A call has the same bits in every round.
@@ -47,19 +72,17 @@ def native_rows(data_root: Path | None, quick: bool = False) -> Iterator[Row]:
 _Timed = tuple[float, RefinementResult]
 
 
-def _pairs(
-    refiner: DirectShapeRefiner, inputs: tuple[FrameBatch, Detections], rounds: int
-) -> Iterator[tuple[_Timed, _Timed]]:
-    """Times and results of calls with and without native loops, in turn, after a first call that is not measured."""
+def _pairs(one: _Refine, other: _Refine, inputs: _Inputs, rounds: int) -> Iterator[tuple[_Timed, _Timed]]:
+    """Times and results of calls one way and the other, in turn, after a first call that is not measured."""
 
-    def timed(region: AbstractContextManager[None]) -> _Timed:
-        with region, torch.no_grad():
+    def timed(refine: _Refine) -> _Timed:
+        with torch.no_grad():
             start = time.process_time()
-            result = refiner(*inputs)
+            result = refine(*inputs).cpu()
             return time.process_time() - start, result
 
     for number in range(rounds + 1):
-        pair = timed(nullcontext()), timed(without_kernels())
+        pair = timed(one), timed(other)
         if number:
             yield pair
 

@@ -17,7 +17,6 @@ from types import CodeType, FrameType
 from typing import Any
 
 from benchmark_suites.measures import OperationCount
-from benchmark_suites.times import make_refiner
 from benchmark_suites.timing import Row, Spread
 from benchmark_suites.workloads import demo_scene
 from directshape_torch.io.frame_collation import collate
@@ -55,8 +54,8 @@ PARTS: dict[str, tuple[Any, ...]] = {
 
 
 def profile_rows(rounds: int) -> list[Row]:
-    """Rows with milliseconds and operations of each part of an eager call of the bundled frame, default settings."""
-    call = partial(make_refiner("default", False), *collate(demo_scene().frames))
+    """Rows with milliseconds and operations of each part of a call of the bundled frame, default settings."""
+    call = partial(DirectShapeRefiner(), *collate(demo_scene().frames))
     call()
     times = [profile_parts(call, time.perf_counter) for _ in range(rounds)]
     with OperationCount() as count:
@@ -74,7 +73,7 @@ def profile_parts(call: Callable[[], object], reading: Callable[[], float]) -> C
     """Run `call` once in this thread and return the increase of a reading in each of `PARTS` and in the rest.
 
     Args:
-        call: eager code; compiled code is seen only as a whole.
+        call: what is run.
         reading: reading of a clock or a counter.
     """
     recorder = _Recorder(reading)

@@ -17,24 +17,10 @@ _BATCH_FRAMES = 8  # of a call that refines a data set without waiting for singl
 _PRESETS = ("default", "fast")
 
 
-def make_refiner(preset: str, compiled: bool, *overrides: str) -> DirectShapeRefiner:
-    """A refiner with the settings of a preset, on the CPU.
-
-    Examples:
-        >>> make_refiner("fast", False, "silhouette.weight=6").config.silhouette.weight
-        6.0
-    """
-    return DirectShapeRefiner(config=load_config(preset, [f"compile={'on' if compiled else 'off'}", *overrides]))
-
-
 def time_rows(scene: Scene, rounds: int, quick: bool = False) -> Iterator[Row]:
-    """Milliseconds, operations and memory of both presets, eager and compiled, of single frames and of 8 in a call."""
-    modes = (False,) if quick else (False, True)
-    refiners = {
-        f"{preset}, {'compiled' if compiled else 'eager'}": make_refiner(preset, compiled)
-        for preset in (_PRESETS[:1] if quick else _PRESETS)
-        for compiled in modes
-    }
+    """Milliseconds, operations and memory of both presets, of single frames and of 8 in a call."""
+    presets = _PRESETS[:1] if quick else _PRESETS
+    refiners = {preset: DirectShapeRefiner(config=load_config(preset)) for preset in presets}
     for size in (1,) if quick else (1, _BATCH_FRAMES):
         # The last call is filled with the first frames again, so that every call has its full size.
         endless, count = itertools.cycle(scene.frames), -(-len(scene.frames) // size)
@@ -44,7 +30,7 @@ def time_rows(scene: Scene, rounds: int, quick: bool = False) -> Iterator[Row]:
         for name, first in sides[0].items():
             what = f"{scene.name}, {size} frame{'s' if size > 1 else ''} in a call, {name}"
             per_car = [1e3 * t[name] / len(call[1]) for t, call in zip(times, calls, strict=True)]
-            note = f"{count_operations(first)} operations, " if name.endswith("eager") else ""
-            note += f"{peak_tensor_bytes(first) / 2**20 / len(calls[0][1]):.1f} MB a car, of the first call"
+            memory = f"{peak_tensor_bytes(first) / 2**20 / len(calls[0][1]):.1f} MB a car"
+            note = f"{count_operations(first)} operations, {memory}, of the first call"
             yield Row(f"{what}: ms a call", Spread.of([1e3 * t[name] for t in times]), note)
             yield Row(f"{what}: ms a car", Spread.of(per_car))

@@ -37,7 +37,7 @@ def test_demo_car(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize("setting", ["photometric.weight=0", "silhouette.weight=0"])
 def test_without_both_of_the_papers_terms_there_is_no_drift(setting: str) -> None:
     data = demo_dataset()
-    refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off", setting]))
+    refiner = DirectShapeRefiner(config=load_config("fast", [setting]))
     assert silhouette_trace(refiner, data.load("000000")) is None
 
 

@@ -38,7 +38,7 @@ from helpers.priors import prior_of
 from helpers.problems import DEFAULT, GEOMETRIC
 from helpers.synthetic_scene import disturbed, measured_street
 
-_SHIPPED = load_config("default", ["compile=off"])
+_SHIPPED = load_config("default")
 # What two iterations do, all do; `default` goes on until cars leave.
 _FEW_STEPS = replace(DEFAULT, stages=tuple(replace(stage, max_iterations=2) for stage in DEFAULT.stages))
 _SIGMAS = {"pose_sigma_along_m": 0.5, "pose_sigma_across_m": 0.3, "pose_sigma_vertical_m": 0.2}

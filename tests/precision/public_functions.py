@@ -140,7 +140,7 @@ def street() -> tuple[FrameBatch, Detections]:
 
 @cache
 def refiner() -> DirectShapeRefiner:
-    quick = ["stages=[{contour_width_px: 0.5, image_level: 0, max_iterations: 2}]", "compile=off", "check=off"]
+    quick = ["stages=[{contour_width_px: 0.5, image_level: 0, max_iterations: 2}]", "check=off"]
     return DirectShapeRefiner(grids(), load_config(None, quick))
 
 

@@ -31,7 +31,7 @@ def demo() -> LoadedFrame:
 
 
 def refined(demo: LoadedFrame, detections: Detections, *settings: str) -> RefinementResult:
-    config = load_config(None, ["compile=off", "check=off", *settings])
+    config = load_config(None, ["check=off", *settings])
     with torch.no_grad():
         return DirectShapeRefiner(config=config)(demo.frame, detections)
 
@@ -175,7 +175,7 @@ def test_views_of_a_track_agree_on_the_front(demo: LoadedFrame, cars: Detections
     start = twice.T_cam_obj.clone()
     start[count:] = turned(start[count:], 180)
     views = replace(twice, T_cam_obj=start, track_id=torch.arange(count).repeat(2))
-    config = load_config(None, ["compile=off", "check=off"])
+    config = load_config(None, ["check=off"])
     with torch.no_grad():
         found = DirectShapeRefiner(config=config)(frames, with_others(views, turned(start, 180)))
     assert found.refined.all()

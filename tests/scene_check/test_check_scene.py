@@ -78,7 +78,7 @@ def test_mistakes_that_take_several_frames(name: str, data: str, detections: str
 def test_the_refiner_warns_as_often_as_it_is_told() -> None:
     wrong = MISTAKES["centre of the box for its bottom"].make(*demo())
     for when, times in (("first", 1), ("always", 2), ("off", 0)):
-        refiner = DirectShapeRefiner(config=load_config("fast", [f"check={when}", "compile=off"]))
+        refiner = DirectShapeRefiner(config=load_config("fast", [f"check={when}"]))
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             for _ in range(2):
@@ -91,7 +91,7 @@ def test_the_refiner_warns_as_often_as_it_is_told() -> None:
 def test_results_do_not_depend_on_the_check() -> None:
     frames, detections = demo()
     a, b = (
-        DirectShapeRefiner(config=load_config("fast", [f"check={when}", "compile=off"]))(frames, detections)
+        DirectShapeRefiner(config=load_config("fast", [f"check={when}"]))(frames, detections)
         for when in ("always", "off")
     )
     assert a.T_cam_obj.equal(b.T_cam_obj)

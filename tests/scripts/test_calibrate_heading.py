@@ -37,7 +37,7 @@ def test_the_table_has_predicted_beside_true_shares() -> None:
 
 
 def test_the_demo_from_its_masks_is_judged(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    masks = ["--masks", str(DEMO / "training" / "masks"), "--set", "compile=off"]
+    masks = ["--masks", str(DEMO / "training" / "masks")]
     assert directshape(["refine", "--data", str(DEMO), *masks, "--out", str(tmp_path / "run")]) == 0
     assert calibrate_heading.main(["--run", str(DEMO), str(tmp_path / "run")]) == 0
     assert "| demo run | " in capsys.readouterr().out.splitlines()[-1]

@@ -27,7 +27,7 @@ _CAR = 1
 def course() -> CarCourse:
     data = demo_dataset()
     loaded = data.load(data.frame_ids[0])
-    refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off", *IMAGES_ALONE]))
+    refiner = DirectShapeRefiner(config=load_config("fast", [*IMAGES_ALONE]))
     return CarCourse(loaded, trace_refinement(refiner, loaded.frame, loaded.detections), _CAR)
 
 
@@ -109,7 +109,7 @@ def test_cars_that_did_not_take_part_are_refused(course: CarCourse) -> None:
     detections = course.loaded.detections
     T_cam_obj = detections.T_cam_obj.clone()
     T_cam_obj[_CAR, 2, 3] = torch.nan
-    refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off", "stages=[{max_iterations: 1}]"]))
+    refiner = DirectShapeRefiner(config=load_config("fast", ["stages=[{max_iterations: 1}]"]))
     trace: RefinementTrace = trace_refinement(refiner, course.loaded.frame, replace(detections, T_cam_obj=T_cam_obj))
     with pytest.raises(InputError, match="non_finite"):
         CarCourse(course.loaded, trace, _CAR)

@@ -32,7 +32,7 @@ def _with_lost_car(detections: Detections) -> Detections:
 
 @pytest.fixture(scope="module", params=["fast", "geometric"])
 def trace(request: pytest.FixtureRequest, demo_frame: LoadedFrame) -> RefinementTrace:
-    refiner = DirectShapeRefiner(config=load_config(request.param, ["compile=off", *IMAGES_ALONE]))
+    refiner = DirectShapeRefiner(config=load_config(request.param, [*IMAGES_ALONE]))
     return trace_refinement(refiner, demo_frame.frame, _with_lost_car(demo_frame.detections))
 
 
@@ -75,7 +75,7 @@ def test_cars_move_where_a_step_was_accepted_and_nowhere_else(trace: RefinementT
 def test_no_cars_at_all(demo_frame: LoadedFrame) -> None:
     T_cam_obj = torch.full_like(demo_frame.detections.T_cam_obj, torch.nan)
     T_cam_obj[:, :3, :3] = torch.eye(3)
-    refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off"]))
+    refiner = DirectShapeRefiner(config=load_config("fast"))
     trace = trace_refinement(refiner, demo_frame.frame, replace(demo_frame.detections, T_cam_obj=T_cam_obj))
     assert len(trace) == len(trace.costs) == 1
     assert len(trace.rows) == 0
