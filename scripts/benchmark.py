@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> None:
     if args.compiled:
         from benchmark_suites.native_loops import compiled_rows
 
-        show(list(compiled_rows(root, device, args.quick)))
+        show(list(compiled_rows(root, args.quick)))
     if not (args.profile or args.native or args.compiled or args.against):
         scenes = load_scenes(root, 1 if args.quick else None)
         show([row for scene in scenes for row in time_rows(scene, rounds, args.quick)])

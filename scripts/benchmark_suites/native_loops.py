@@ -12,7 +12,6 @@ from statistics import median
 
 import torch
 
-from benchmark_suites.times import on_device
 from benchmark_suites.timing import Row, Spread
 from benchmark_suites.workloads import load_scenes
 from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, RefinementResult, load_config
@@ -22,9 +21,6 @@ from directshape_torch.kernels.choice import without_kernels
 _SINGLE_FRAMES, _BATCH_FRAMES, _ROUNDS = 3, 8, 7
 _SCENES = "rendered", "kitti", "kitti15"
 _NEAR_M = 1e-3
-_CPU = torch.device("cpu")
-
-
 _Inputs = tuple[FrameBatch, Detections]
 _Refine = Callable[[FrameBatch, Detections], RefinementResult]
 
@@ -41,15 +37,13 @@ def native_rows(data_root: Path | None, quick: bool = False) -> Iterator[Row]:
     return _rows(data_root, quick, refiner, by_tensor_operations)
 
 
-def compiled_rows(data_root: Path | None, device: torch.device, quick: bool = False) -> Iterator[Row]:
+def compiled_rows(data_root: Path | None, quick: bool = False) -> Iterator[Row]:
     """With `compile: on` over off, both with native loops where there are any."""
-    on, off = (DirectShapeRefiner(config=load_config(None, [f"compile={mode}"])).to(device) for mode in ("on", "off"))
-    return _rows(data_root, quick, on, off, device)
+    on, off = (DirectShapeRefiner(config=load_config(None, [f"compile={mode}"])) for mode in ("on", "off"))
+    return _rows(data_root, quick, on, off)
 
 
-def _rows(
-    data_root: Path | None, quick: bool, one: _Refine, other: _Refine, device: torch.device = _CPU
-) -> Iterator[Row]:
+def _rows(data_root: Path | None, quick: bool, one: _Refine, other: _Refine) -> Iterator[Row]:
     """Ratios of processor time for single frames and for 8 in a call, and how far apart cars end."""
     for scene in load_scenes(data_root, _BATCH_FRAMES, _SCENES):
         single = range(1 if quick else min(len(scene.frames), _SINGLE_FRAMES))
@@ -57,7 +51,6 @@ def _rows(
         if not quick:
             calls[f"{len(scene.frames)} frames in a call"] = [collate(scene.frames)]
         for what, inputs in calls.items():
-            inputs = [on_device(*each, device) for each in inputs]
             compared = [pair for each in inputs for pair in _pairs(one, other, each, 1 if quick else _ROUNDS)]
             seconds = [(mine[0], others[0]) for mine, others in compared]
             note = " over ".join(f"{1e3 * median(side):.0f} ms" for side in zip(*seconds, strict=True))
@@ -78,7 +71,7 @@ def _pairs(one: _Refine, other: _Refine, inputs: _Inputs, rounds: int) -> Iterat
     def timed(refine: _Refine) -> _Timed:
         with torch.no_grad():
             start = time.process_time()
-            result = refine(*inputs).cpu()
+            result = refine(*inputs)
             return time.process_time() - start, result
 
     for number in range(rounds + 1):
