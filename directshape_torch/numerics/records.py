@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from typing import Any, ClassVar, NamedTuple, Self, get_type_hints
 
@@ -33,9 +33,22 @@ class Dense:
         sizes |= dict(zip(self.shape, value.shape, strict=True))
 
 
-def dense_of(hint: object) -> Dense | None:
-    """The declaration in the type of a field, if there is one."""
-    return next((each for each in getattr(hint, "__metadata__", ()) if isinstance(each, Dense)), None)
+def declared(record: object) -> dict[str, Dense | None]:
+    """The declaration of each field of a dataclass or a named tuple, None where a field has no declaration."""
+    kind: Any = type(record)
+    return _declared_by(kind)
+
+
+@cache
+def _declared_by(kind: type) -> dict[str, Dense | None]:
+    names = [each.name for each in fields(kind)] if is_dataclass(kind) else getattr(kind, "_fields", ())
+    try:
+        hints = get_type_hints(kind, include_extras=True) if names else {}
+    except NameError as error:
+        cure = "import the types of its fields at the top of the module, outside of TYPE_CHECKING"
+        raise InputError(kind.__name__, "fields whose types are known at run time", str(error), cure) from error
+    marks = {name: getattr(hints.get(name), "__metadata__", ()) for name in names}
+    return {name: next((x for x in of_field if isinstance(x, Dense)), None) for name, of_field in marks.items()}
 
 
 class DeclaredTensor(NamedTuple):
@@ -51,13 +64,6 @@ class Record:
 
     # A shared field is one for all rows and is kept where rows are chosen.
     shared: ClassVar[frozenset[str]] = frozenset()
-
-    @classmethod
-    @cache
-    def _hints(cls) -> dict[str, Any]:
-        """The types of the fields by name, with the declarations of tensors."""
-        hints = get_type_hints(cls, include_extras=True)
-        return {each.name: hints[each.name] for each in fields(cls)}  # type: ignore[arg-type]
 
     def to(self, device: torch.device | torch.dtype | str | None = None, dtype: torch.dtype | None = None) -> Self:
         """A copy on another device, and with another dtype of floating-point tensors; a dtype may come alone."""
@@ -111,31 +117,20 @@ class TensorRecord(Record):
     def __post_init__(self) -> None:
         sizes: dict[int | str, int] = {}
         first: DeclaredTensor | None = None
-        for name, (spec, is_optional) in self._declared().items():
-            value = getattr(self, name)
-            if value is None and is_optional:
+        for each in fields(self):  # type: ignore[arg-type]
+            name, value, spec = each.name, getattr(self, each.name), declared(self)[each.name]
+            if spec is None or (value is None and each.default is None):
                 continue
             spec.check(name, value, sizes)
             if spec.kind in FOLLOWING:
                 first = first or DeclaredTensor(name, value, spec.kind)
                 check_alike(name, value, first.name, first.value)
 
-    @classmethod
-    @cache
-    def _declared(cls) -> dict[str, tuple[Dense, bool]]:
-        """The declaration of each tensor by name, and whether None may take its place."""
-        return {
-            each.name: (spec, each.default is None)
-            for each in fields(cls)  # type: ignore[arg-type]
-            for spec in getattr(cls._hints()[each.name], "__metadata__", ())
-            if isinstance(spec, Dense)
-        }
-
     def in_dtype(self, dtype: torch.dtype) -> Self:
         """The record with its numbers, and the numbers of records inside it, in a dtype; masks keep their dtype."""
         changed: dict[str, Any] = {}
         for each in fields(self):  # type: ignore[arg-type]
-            value, (spec, _) = getattr(self, each.name), self._declared().get(each.name, (None, False))
+            value, spec = getattr(self, each.name), declared(self)[each.name]
             if isinstance(value, TensorRecord):
                 changed[each.name] = value.in_dtype(dtype)
             elif value is not None and spec is not None and spec.kind in FOLLOWING:
@@ -145,13 +140,12 @@ class TensorRecord(Record):
 
     def tensors(self, name: str) -> Iterator[DeclaredTensor]:
         """All tensors of the record, which is called `name`, and of records inside it."""
-        declared = self._declared()
-        for each in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, each.name)
+        for field, spec in declared(self).items():
+            value = getattr(self, field)
             if isinstance(value, TensorRecord):
-                yield from value.tensors(f"{name}.{each.name}")
-            elif each.name in declared and value is not None:
-                yield DeclaredTensor(f"{name}.{each.name}", value, declared[each.name][0].kind)
+                yield from value.tensors(f"{name}.{field}")
+            elif spec is not None and value is not None:
+                yield DeclaredTensor(f"{name}.{field}", value, spec.kind)
 
     @classmethod
     def joined(cls, records: Sequence[Self]) -> Self:
@@ -171,6 +165,13 @@ class TensorRecord(Record):
 
 class CarRecord(Record):
     """`CarRecord` is the base of records with one row a car: of tensors (B, ...), `CarRecord`s, words, other values."""
+
+    @classmethod
+    @cache
+    def _hints(cls) -> dict[str, Any]:
+        """The types of the fields by name, with the declarations of tensors."""
+        hints = get_type_hints(cls, include_extras=True)
+        return {each.name: hints[each.name] for each in fields(cls)}  # type: ignore[arg-type]
 
     @classmethod
     def nothing(cls, sizes: Mapping[int | str, int], like: Tensor, **known: Any) -> Self:

@@ -9,15 +9,14 @@ numbers_of="B")]`, as `Blocks` do. All cars share the values of a field without 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields, is_dataclass, replace
-from functools import cache, cached_property
-from typing import Any, Protocol, Self, TypeVar, get_type_hints
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, Protocol, Self, TypeVar
 
 import torch
 from torch import Tensor
 
-from directshape_torch.errors import InputError
-from directshape_torch.numerics.records import Dense, dense_of
+from directshape_torch.numerics.records import Dense, declared
 
 _T = TypeVar("_T")
 
@@ -85,23 +84,6 @@ def take_rows(value: _T, index: Tensor, axis: str = "B") -> _T:
         return part.index_select(spec.shape.index(axis), index) if axis in spec.shape else part
 
     return _changed(value, taken, lambda part: take_rows(part, index, axis)) if is_table(value) else value
-
-
-def declared(table: object) -> dict[str, Dense | None]:
-    """The declaration of each field of a named tuple or a dataclass, None where a field has no declaration."""
-    kind: Any = type(table)
-    return _declared_by(kind)
-
-
-@cache
-def _declared_by(kind: type) -> dict[str, Dense | None]:
-    names = [each.name for each in fields(kind)] if is_dataclass(kind) else getattr(kind, "_fields", ())
-    try:
-        hints = get_type_hints(kind, include_extras=True) if names else {}
-    except NameError as error:
-        cure = "import the types of its fields at the top of the module, outside of TYPE_CHECKING"
-        raise InputError(kind.__name__, "fields whose types are known at run time", str(error), cure) from error
-    return {name: dense_of(hints.get(name)) for name in names}
 
 
 def is_table(value: object) -> bool:

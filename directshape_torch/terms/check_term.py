@@ -13,7 +13,8 @@ from directshape_torch.config import StageConfig
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import check_shape
 from directshape_torch.numerics.gradient_mode import map_tensors
-from directshape_torch.numerics.tables import Chosen, declared, is_table, of
+from directshape_torch.numerics.records import declared
+from directshape_torch.numerics.tables import Chosen, is_table, of
 from directshape_torch.rows import Blocks
 from directshape_torch.shape.field import Field, field_of
 from directshape_torch.shape.shape_prior import ShapePrior

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.numerics.records import Dense
-from directshape_torch.numerics.tables import Chosen, Table, declared, of, take_rows
+from directshape_torch.numerics.records import Dense, declared
+from directshape_torch.numerics.tables import Chosen, Table, of, take_rows
 from directshape_torch.rows import Blocks, PixelSamples, Rows
 
 CARS = Chosen(torch.tensor([False, True, False, True]), [1, 3])
