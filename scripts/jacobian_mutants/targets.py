@@ -132,7 +132,7 @@ TARGETS: dict[str, Target] = {
     ),
     "unknowns": Target(
         "directshape_torch/state/unknowns.py",
-        ("Block.moved", "Unknowns.span", "Unknowns.placed", "Unknowns.retract"),
+        ("Block.moved", "Unknowns.span", "Unknowns.placed", "Unknowns.retract", "Unknowns.derivative"),
         (*_OFFSET[:1], "tests/state/test_unknowns.py", *_JACOBIANS),
     ),
     "offset": Target("directshape_torch/state/cars.py", ("CarBatch.inverse_depth_of_offset",), _OFFSET),
@@ -183,14 +183,12 @@ TARGETS: dict[str, Target] = {
             "cells_at",
             "corner_values",
             "halves",
-            "moved",
         ),
         ("tests/shape/test_sdf_grid.py",),
     ),
-    "scaled_ends": Target("directshape_torch/shape/sdf_grid.py", ("scaled",), (_MINIMUM, *_JACOBIANS)),
     "short_axes": Target(
         "directshape_torch/numerics/tensors.py",
-        ("length", "all_along", "cross"),
+        ("length", "all_along"),
         ("tests/geometry/test_short_axes.py",),
     ),
     "bracket": Target(
