@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.numerics.tensors import not_negative, take
+from directshape_torch.numerics.tensors import take
 
 
 class BilinearPatch(NamedTuple):
@@ -67,6 +67,6 @@ def _cell(
     last = last.int() if isinstance(last, Tensor) else coordinate.new_full((), last, dtype=torch.int32)
     # A choice by `inside` would take four times as long, `minimum` would halve derivatives on the last row, and NaN
     # must not become an index.
-    clamped = not_negative(coordinate).clamp_max(last)
+    clamped = coordinate.nan_to_num(0.0).clamp_min(0).clamp_max(last)
     index = clamped.detach().int().minimum((last - 1).clamp_min(0))
     return clamped - index, clamped == coordinate, index, last.clamp(max=1)

@@ -88,13 +88,3 @@ def all_along(flags: Tensor, dim: int) -> Tensor:
     if torch.compiler.is_compiling():
         return flags.all(dim)  # PyTorch 2.13 makes wrong C++ of the view.
     return flags.view(torch.uint8).amin(dim).view(torch.bool)
-
-
-def not_negative(values: Tensor) -> Tensor:
-    """The values, and 0 in place of negative ones and of NaN.
-
-    Examples:
-        >>> not_negative(torch.tensor([2.0, -2.0, torch.nan]))
-        tensor([2., 0., 0.])
-    """
-    return values.nan_to_num(0.0).clamp_min(0)

@@ -27,7 +27,7 @@ from directshape_torch.errors import InputError
 from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.numerics.records import Dense
-from directshape_torch.numerics.tensors import constant_like
+from directshape_torch.numerics.tensors import constant_like, take
 from directshape_torch.shape.shape_prior import SdfDerivatives
 
 # This number is negligible next to any distance, and a normal number in single precision.
@@ -244,8 +244,7 @@ def cells_at(grid: GridShape, points_obj: Tensor) -> Cells:
 
 def corner_values(grid: GridShape, node: Tensor) -> Tensor:
     """Signed distances (8, ...) at the corners of cells, from their lower nodes (...) among the nodes of all grids."""
-    corners = at_corners(grid, node)
-    return grid.values.reshape(-1).index_select(0, corners.view(-1)).view(corners.shape)
+    return take(grid.values.reshape(-1), at_corners(grid, node))
 
 
 def halves(ends: Tensor) -> tuple[Tensor, Tensor]:
