@@ -15,7 +15,7 @@ from directshape_torch.scene.frames import FrameBatch
 _BLOCK_SIZE_PX = 5
 _UNIQUENESS_PERCENT = 10
 _FRACTION = 16  # OpenCV counts disparity in sixteenths of a pixel
-_NUM_DISPARITIES = 192
+_NUM_DISPARITIES = 192  # the largest one that is searched, a multiple of 16
 # A part of an image is matched with so many pixels around it: 16 in which disparities are looked up beside masks, and
 # 32 whose smoothness tells on those.
 _AROUND_PX = 48
@@ -24,7 +24,6 @@ _AROUND_PX = 48
 def match_disparity(
     image_left: NDArray[np.uint8],  # (H, W, 3) RGB
     image_right: NDArray[np.uint8],  # (H, W, 3)
-    num_disparities: int = _NUM_DISPARITIES,
     context_px: int = 0,
 ) -> NDArray[np.float32]:  # (H, W - context)
     """Disparity of each left pixel, `u_left - u_right`, with a left-right and a uniqueness check.
@@ -35,8 +34,7 @@ def match_disparity(
 
     Args:
         image_left, image_right: rectified pair, RGB uint8 of one size.
-        num_disparities: the largest disparity searched, a multiple of 16.
-        context_px: this many of the first columns, at most `num_disparities`, are matched with others only.
+        context_px: this many of the first columns, at most 192, are matched with others only.
 
     Returns:
         Disparity in pixels, NaN where unknown.
@@ -44,17 +42,15 @@ def match_disparity(
     import cv2
 
     _check_pair(image_left, image_right)
-    if num_disparities <= 0 or num_disparities % 16:
-        raise InputError("num_disparities", "a positive multiple of 16", str(num_disparities))
     # The padding keeps the leftmost columns, whose matches lie outside of the right image for large disparities only.
-    pad = (0, 0, num_disparities - context_px, 0, cv2.BORDER_REPLICATE)
+    pad = (0, 0, _NUM_DISPARITIES - context_px, 0, cv2.BORDER_REPLICATE)
     left, right = (
         cv2.copyMakeBorder(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), *pad)
         for image in (image_left, image_right)
     )
     matcher = cv2.StereoSGBM_create(  # type: ignore[attr-defined]
         minDisparity=0,
-        numDisparities=num_disparities,
+        numDisparities=_NUM_DISPARITIES,
         blockSize=_BLOCK_SIZE_PX,
         P1=8 * _BLOCK_SIZE_PX**2,
         P2=32 * _BLOCK_SIZE_PX**2,
@@ -65,7 +61,7 @@ def match_disparity(
         speckleRange=2,
         mode=cv2.STEREO_SGBM_MODE_HH4,
     )
-    sixteenths = matcher.compute(left, right)[:, num_disparities:]
+    sixteenths = matcher.compute(left, right)[:, _NUM_DISPARITIES:]
     disparity = np.asarray(sixteenths, dtype=np.float32) / np.float32(_FRACTION)
     disparity[disparity <= 0] = np.nan
     return disparity

@@ -170,12 +170,8 @@ def timed(sharing: Groups, cars: CarBatch) -> CarBatch:
     T_path_cam = cars.T_world_cam
     if T_path_cam is not None:
         T_path_cam = se3.inverse(T_path_cam[sharing.rows[:, 0]][sharing.of_problem]) @ T_path_cam
-    return replace(cars, time_s=cars.time_s - _mean(sharing, cars.time_s), T_world_cam=T_path_cam)
-
-
-def _mean(sharing: Groups, values: Tensor) -> Tensor:
-    everyone = sharing.all_members
-    return sharing.total(values, everyone) / sharing.total(torch.ones_like(values), everyone)
+    total, count = (sharing.total(x, sharing.all_members) for x in (cars.time_s, torch.ones_like(cars.time_s)))
+    return replace(cars, time_s=cars.time_s - total / count, T_world_cam=T_path_cam)
 
 
 def _basis(cars: CarBatch) -> Tensor:

@@ -103,7 +103,7 @@ class Views:
     chosen: Chosen  # cars of the call that are these views
     problem: CarProblem  # problem of these views, with the last stage alone
     agreement: Groups  # groups of views that share a code
-    cars: CarBatch  # all B cars
+    cars: CarBatch  # the views
     timed: CarBatch  # the views, with times and cameras relative to their track
     alone: CarState  # states where the views ended when refined alone
     hessian: Tensor  # (R, D, D) Hessian of the cost of each view at `alone`
@@ -129,18 +129,18 @@ class Views:
         ends = take_rows(minimum.end, rows)
         sharing = Groups.from_numbers(group, *own_and_shared(ends), place=place)
         chosen = Chosen(keep, numbers)
-        views = timed(sharing, alone.cars.of(chosen))
+        cars = alone.cars.of(chosen)
+        views = timed(sharing, cars)
         trusted = is_refined(minimum.status).index_select(0, rows)
         next_view = torch.tensor([numbers.index(row) for row in after], device=keep.device)
         problem = in_tracks(alone.problem.of(chosen), sharing, views, ends, trusted, next_view)
         part_number = torch.tensor(of_part, device=keep.device)
         hessian = minimum.after.hessian.sum(dim=1)[rows]
-        return cls(chosen, problem, sharing, alone.cars, views, ends, hessian, part_number, next_view)
+        return cls(chosen, problem, sharing, cars, views, ends, hessian, part_number, next_view)
 
     def refined(self, initial: CarState, unrefined: RefinementResult) -> Refined[TrackState]:
         """The views refined together, starting from the shape on which they agree."""
-        cars = self.cars.of(self.chosen)
-        return Refined.of(self.problem, cars, self.linked(initial), self.agreed(self.alone), unrefined)
+        return Refined.of(self.problem, self.cars, self.linked(initial), self.agreed(self.alone), unrefined)
 
     def agreed(self, alone: CarState) -> TrackState:
         """Return states (R) with the one shape on which the views agree best, and with the poses that belong to it.
@@ -152,8 +152,8 @@ class Views:
         of_code, max_code = unknowns.span(CODE), self.problem.config.solver.max_code
         step = unknowns.placed(alone.code.to(self.hessian.dtype), (CODE,))
         slope = -(self.hessian @ step[:, :, None])[:, :, 0]
-        undamped, everyone = torch.zeros_like(slope[:, 0]), torch.ones_like(slope[:, 0], dtype=torch.bool)
-        to_agreement, _ = self.agreement.damped_step(self.hessian, slope, undamped, everyone)
+        undamped = torch.zeros_like(slope[:, 0])
+        to_agreement, _ = self.agreement.damped_step(self.hessian, slope, undamped, self.agreement.all_members)
         code = to_agreement[:, of_code].to(alone.code).clamp(-max_code, max_code)
         return self.linked(unknowns.retract(alone, to_agreement - step)._replace(code=code))
 
