@@ -197,10 +197,10 @@ def _is_out_of_reach(frames: FrameBatch, made: Detections, T_cam_obj: Tensor) ->
     Depths of stereo are off by more, the farther the car.
     """
     assert made.other_T_cam_obj is not None
-    poses = torch.cat([made.T_cam_obj[:, None], made.other_T_cam_obj], dim=1)
-    off_m = (poses[..., 0:3:2, 3] - T_cam_obj[:, None, 0:3:2, 3]).norm(dim=-1)
-    cos_turned = (poses[..., :3, 0] * T_cam_obj[:, None, :3, 0]).sum(dim=-1).abs()
-    is_far = off_m > _REACH_M + depth_noise(frames, made.frame_index, poses[..., 2, 3])
+    T_cam_start = torch.cat([made.T_cam_obj[:, None], made.other_T_cam_obj], dim=1)
+    off_m = (T_cam_start[..., 0:3:2, 3] - T_cam_obj[:, None, 0:3:2, 3]).norm(dim=-1)
+    cos_turned = (T_cam_start[..., :3, 0] * T_cam_obj[:, None, :3, 0]).sum(dim=-1).abs()
+    is_far = off_m > _REACH_M + depth_noise(frames, made.frame_index, T_cam_start[..., 2, 3])
     # NaN, for a mask without a car, is not farther.
     is_elsewhere: Tensor = is_far | (cos_turned < math.cos(_REACH_RAD))
     return is_elsewhere.any(dim=1)
