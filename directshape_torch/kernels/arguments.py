@@ -15,6 +15,10 @@ Flags: TypeAlias = NDArray[np.bool_]
 Index: TypeAlias = Any
 """An unsigned integer of 64 bits."""
 Point: TypeAlias = tuple[Real, Real, Real]
+Points: TypeAlias = Any
+"""Coordinates x, y and z of points, (R,) each."""
+Corners: TypeAlias = tuple[tuple[Real, Real, Real, Real], tuple[Real, Real, Real, Real]]
+"""Signed distances at the corners 00, 10, 01, 11 of x and y of a cell; the second four are one node further along z."""
 
 
 def singles(*numbers: float) -> list[Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from directshape_torch.kernels.arguments import Grid, Index, Point, Real, Reals
+from directshape_torch.kernels.arguments import Corners, Grid, Index, Point, Real, Reals
 from directshape_torch.kernels.jit import step
 
 ZERO, HALF, ONE, TWO, THREE = (np.float32(x) for x in (0, 0.5, 1, 2, 3))
@@ -53,13 +53,14 @@ def each_clamped(point: Point, last: Point) -> Point:
 @step
 def as_index(cell: Real) -> Index:
     """The index of a cell; NaN and negative numbers give 0."""
-    return np.uint64(np.int64(cell)) if cell > ZERO else np.uint64(0)
+    return np.uint32(cell) if cell > ZERO else np.uint32(0)
 
 
 @step
 def node_of(grid: Grid, cell: Point) -> Index:
     """Flat index, within one grid, of the lower corner of a cell of the grid."""
-    return as_index(cell[0]) * grid.stride_x + as_index(cell[1]) * grid.stride_y + as_index(cell[2])
+    along_x, along_y = as_index(cell[0]) * np.uint32(grid.stride_x), as_index(cell[1]) * np.uint32(grid.stride_y)
+    return along_x + along_y + as_index(cell[2])
 
 
 @step
@@ -86,14 +87,9 @@ def cell_at(grid: Grid, position: Point) -> tuple[Index, Point]:
 
 
 @step
-def corners(
-    grid: Grid, first: Index, node: Index
-) -> tuple[tuple[Real, Real, Real, Real], tuple[Real, Real, Real, Real]]:
-    """Signed distances at the corners of a cell of the car whose nodes begin at `first`: 00, 10, 01, 11, below, above.
-
-    The pairs are of x and y; the second four are one node further along z.
-    """
-    values, n, x, y = grid.values, first + node, grid.stride_x, grid.stride_y
+def corners(grid: Grid, first: Index, node: Index) -> Corners:
+    """Signed distances around a cell of the car whose nodes begin at `first`."""
+    values, n, x, y = grid.values, first + np.uint64(node), grid.stride_x, grid.stride_y
     up = n + NEXT
     lower = values[n], values[n + x], values[n + y], values[n + x + y]
     return lower, (values[up], values[up + x], values[up + y], values[up + x + y])
@@ -102,35 +98,44 @@ def corners(
 @step
 def value_at(grid: Grid, first: Index, point: Point) -> Real:
     """Signed distance at a point within the grid."""
-    node, (ux, uy, uz) = cell_at(grid, position_of(grid, point))
-    a, b = corners(grid, first, node)
+    node, place = cell_at(grid, position_of(grid, point))
+    return value_in(place, corners(grid, first, node))
+
+
+@step
+def value_in(place: Point, corners: Corners) -> Real:
+    """Signed distance at a place in a cell."""
+    (ux, uy, uz), (a, b) = place, corners
     near = between(between(a[0], uz, b[0]), uy, between(a[2], uz, b[2]))
     return between(near, ux, between(between(a[1], uz, b[1]), uy, between(a[3], uz, b[3])))
 
 
 @step
-def value_and_gradient_at(grid: Grid, first: Index, point: Point) -> tuple[Real, Point]:
-    """Signed distance and its gradient at a point, which may lie outside the grid."""
-    position = position_of(grid, point)
-    node, (ux, uy, uz) = cell_at(grid, position)
-    a, b = corners(grid, first, node)
+def gradient_in(grid: Grid, position: Point, place: Point, corners: Corners) -> tuple[Real, Point]:
+    """Signed distance and its gradient at a position, which may lie outside the grid, with the place in its cell."""
+    (ux, uy, uz), (a, b) = place, corners
     c00, c10 = between(a[0], uz, b[0]), between(a[1], uz, b[1])
     c01, c11 = between(a[2], uz, b[2]), between(a[3], uz, b[3])
     low, high = between(c00, uy, c01), between(c10, uy, c11)
     along_z = between(between(b[0] - a[0], uy, b[2] - a[2]), ux, between(b[1] - a[1], uy, b[3] - a[3]))
     slope = scaled((high - low, between(c01 - c00, ux, c11 - c10), along_z), grid.per_m)
-    value = between(low, ux, high)
     nearest = each_clamped(position, grid.last)
     out = position[0] - nearest[0], position[1] - nearest[1], position[2] - nearest[2]
-    if out[0] == ZERO and out[1] == ZERO and out[2] == ZERO:
-        return value, slope
     distance = np.sqrt(dot(out, out) + _TINY)
     gradient = (
         slope[0] if out[0] == ZERO else out[0] / distance,
         slope[1] if out[1] == ZERO else out[1] / distance,
         slope[2] if out[2] == ZERO else out[2] / distance,
     )
-    return value + grid.spacing_m * distance, gradient
+    return between(low, ux, high) + grid.spacing_m * distance, gradient
+
+
+@step
+def value_and_gradient_at(grid: Grid, first: Index, point: Point) -> tuple[Real, Point]:
+    """Signed distance and its gradient at a point, which may lie outside the grid."""
+    position = position_of(grid, point)
+    node, place = cell_at(grid, position)
+    return gradient_in(grid, position, place, corners(grid, first, node))
 
 
 @step

@@ -17,7 +17,7 @@ def write_jacobian(
     (x, y, z), (u, v, w) = point, scaled(gradient, scale)
     J[0], J[1], J[2] = u, v, w
     J[3], J[4], J[5] = y * w - z * v, z * u - x * w, x * v - y * u
-    code_derivative_in(grid, node, in_cell, scale, J[6:])
+    code_derivative_in(grid, np.uint64(node), in_cell, scale, J[6:])
 
 
 @step
