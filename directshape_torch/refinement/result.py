@@ -34,10 +34,8 @@ from directshape_torch.status import Status, counted, is_refined
 if TYPE_CHECKING:
     import trimesh
 
-
 Frame = Literal["ref", "cam"]
-# A printed result shows this many cars. A car is doubtful if its probability to have got better is below the second
-# number.
+# A printed result shows this many cars. One that got better with a probability below the second number is doubtful.
 _PRINTED_CARS, _DOUBTFUL_BELOW = 40, 0.5
 
 
@@ -174,8 +172,8 @@ class RefinementResult(CarRecord):
             "term_names": list(self.term_names),
             "ground_source": list(self.ground_source),
         }
-        arrays = {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()}
-        return {**arrays, **{name: np.array(each, dtype=np.str_) for name, each in words.items()}}
+        arrays = {name: np.array(each, dtype=np.str_) for name, each in words.items()}
+        return {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()} | arrays
 
     @classmethod
     def from_state_dict(cls, state: Mapping[str, Tensor], prior: ShapePrior | None = None) -> Self:
@@ -306,8 +304,7 @@ class RefinementResult(CarRecord):
         rows = self.refined.nonzero()[:, 0]
         bottom, hwl = level_boxes(self.prior, T[rows], self.code[rows])
         dimensions = self.input_dimensions_hwl.index_copy(0, rows, hwl)
-        location = T[:, :3, 3].index_copy(0, rows, bottom)
-        return se3.from_rotation_translation(T[:, :3, :3], location), dimensions
+        return se3.from_rotation_translation(T[:, :3, :3], T[:, :3, 3].index_copy(0, rows, bottom)), dimensions
 
     @property
     def sigma_xyz_yaw(self) -> Tensor:
@@ -372,8 +369,7 @@ def _check_state(result: RefinementResult) -> None:
 
 def _check_refined(result: RefinementResult) -> None:
     """Raise `InputError` unless refined cars have finite figures, as results of the refiner do."""
-    boxes = result.boxes()
-    figures = (result.code, result.cost_after, *vars(boxes).values(), result.covariance, result.sigma_xyz_yaw)
+    figures = (result.code, result.cost_after, *vars(result.boxes()).values(), result.covariance, result.sigma_xyz_yaw)
     finite = torch.stack([x[:, None].isfinite().flatten(1).all(dim=1) for x in figures]).all(dim=0)
     wrong = (result.refined & ~finite).nonzero().flatten().tolist()
     if wrong:
