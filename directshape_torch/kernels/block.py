@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.kernels.arguments import Corners, Grid, Index, Point, Points, Rays, Real, Reals
-from directshape_torch.kernels.grid import cell_at, gradient_in, plus, position_of, value_in
+from directshape_torch.kernels.grid import ZERO, cell_at, gradient_in, plus, position_of, value_in
 from directshape_torch.kernels.jit import step
+
+NOWHERE = (ZERO, ZERO, ZERO)
 
 
 class Block(NamedTuple):
@@ -32,8 +34,7 @@ class Block(NamedTuple):
 def room_for(num_rows: int) -> Block:
     """A block without rays."""
     three, eight = np.empty((3, num_rows), np.float32), np.empty((8, num_rows), np.float32)
-    nowhere = np.float32(0), np.float32(0), np.float32(0)
-    return Block(np.uint64(0), nowhere, three, np.empty(num_rows, np.uint32), np.empty_like(three), eight)
+    return Block(np.uint64(0), NOWHERE, three, np.empty(num_rows, np.uint32), np.empty_like(three), eight)
 
 
 @step
@@ -64,9 +65,9 @@ def turned(T: Reals, start: Point, vector: Point) -> Point:
 def block_of(grid: Grid, rays: Rays, number: Index, room: Block) -> Block:
     """The block of a number, in the arrays of another one."""
     car, at_cam, ray_cam = np.uint64(rays.owner[number]), rays.centre_cam[number], of_block(rays.ray_cam, number)
-    T, nowhere = rays.T_obj_cam[car], (np.float32(0), np.float32(0), np.float32(0))
+    T = rays.T_obj_cam[car]
     for row in range(np.uint64(len(room.node))):
-        put(room.direction, row, turned(T, nowhere, at(ray_cam, row)))
+        put(room.direction, row, turned(T, NOWHERE, at(ray_cam, row)))
     centre = turned(T, (T[0, 3], T[1, 3], T[2, 3]), (at_cam[0], at_cam[1], at_cam[2]))
     return Block(car * grid.nodes, centre, room.direction, room.node, room.place, room.corner)
 

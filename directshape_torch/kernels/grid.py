@@ -87,22 +87,6 @@ def cell_at(grid: Grid, position: Point) -> tuple[Index, Point]:
 
 
 @step
-def corners(grid: Grid, first: Index, node: Index) -> Corners:
-    """Signed distances around a cell of the car whose nodes begin at `first`."""
-    values, n, x, y = grid.values, first + np.uint64(node), grid.stride_x, grid.stride_y
-    up = n + NEXT
-    lower = values[n], values[n + x], values[n + y], values[n + x + y]
-    return lower, (values[up], values[up + x], values[up + y], values[up + x + y])
-
-
-@step
-def value_at(grid: Grid, first: Index, point: Point) -> Real:
-    """Signed distance at a point within the grid."""
-    node, place = cell_at(grid, position_of(grid, point))
-    return value_in(place, corners(grid, first, node))
-
-
-@step
 def value_in(place: Point, corners: Corners) -> Real:
     """Signed distance at a place in a cell."""
     (ux, uy, uz), (a, b) = place, corners
@@ -131,14 +115,6 @@ def gradient_in(grid: Grid, position: Point, place: Point, corners: Corners) -> 
 
 
 @step
-def value_and_gradient_at(grid: Grid, first: Index, point: Point) -> tuple[Real, Point]:
-    """Signed distance and its gradient at a point, which may lie outside the grid."""
-    position = position_of(grid, point)
-    node, place = cell_at(grid, position)
-    return gradient_in(grid, position, place, corners(grid, first, node))
-
-
-@step
 def code_derivative_in(grid: Grid, node: Index, place: Point, scale: Real, out: Reals) -> None:
     """Write the derivative of the signed distance by the code, times a scale, into `out` (K or more,)."""
     (ux, uy, uz), x, y, up, basis = place, grid.stride_x, grid.stride_y, node + NEXT, grid.basis
@@ -152,10 +128,9 @@ def code_derivative_in(grid: Grid, node: Index, place: Point, scale: Real, out: 
 
 
 @step
-def derivatives_along(grid: Grid, first: Index, node: Index, place: Point, along: Point) -> tuple[Real, Real, Real]:
+def derivatives_along(corners: Corners, place: Point, along: Point) -> tuple[Real, Real, Real]:
     """First, half of the second and a sixth of the third derivative along a ray, at a place in a cell."""
-    (ux, uy, uz), (dx, dy, dz) = place, along
-    a, b = corners(grid, first, node)
+    (ux, uy, uz), (dx, dy, dz), (a, b) = place, along, corners
     # The polynomial gains a degree with each axis; the letters are those of `shape.sdf_grid._derivatives_along`.
     r00, r10, r01, r11 = b[0] - a[0], b[1] - a[1], b[2] - a[2], b[3] - a[3]
     a00, a10, a01, a11 = a[0] + uz * r00, a[1] + uz * r10, a[2] + uz * r01, a[3] + uz * r11

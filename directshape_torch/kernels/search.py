@@ -1,10 +1,16 @@
-"""This module searches single rays for their closest point, as `terms.depth` and `shape.sdf_grid` search tensors."""
+"""This module searches rays of a block for their closest points, as `terms.depth` and `shape.sdf_grid` search tensors.
+
+Rays that have reached their point wait until all others have, because a row that left early would be a branch.
+"""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from directshape_torch.kernels.arguments import Grid, Index, Point, Rays, Real, Reals, Search
+from directshape_torch.kernels.arguments import Flags, Grid, Point, Points, Real, Reals, Search
+from directshape_torch.kernels.block import NOWHERE, Block, at, corners_of, fetch, put
 from directshape_torch.kernels.grid import (
     HALF,
     ONE,
@@ -21,40 +27,25 @@ from directshape_torch.kernels.grid import (
 )
 from directshape_torch.kernels.jit import step
 
-NOWHERE = (ZERO, ZERO, ZERO)
+
+class Walk(NamedTuple):
+    """A `Walk` holds where the rays of a block are on their way downhill, from cell to cell."""
+
+    start: Reals  # (R,) depth
+    near: Reals  # (R,) depth of the ends
+    far: Reals  # (R,)
+    way: Reals  # (R,) 1 or -1: whether downhill is where the depth grows
+    come: Reals  # (R,) change of the depth up to now, downhill
+    goes_on: Flags  # (R,)
+    cell: Reals  # (3, R) number of the cell along each axis
+    face: Reals  # (3, R) 1 for the axes across whose face the ray leaves its cell
 
 
 @step
-def turned(rays: Rays, car: Index, start: Point, vector: Point) -> Point:
-    """The point `start + R vector` with the rotation R of a car."""
-    T = rays.T_obj_cam[car]
-    x = plus(start, vector[0], (T[0, 0], T[1, 0], T[2, 0]))
-    y = plus(x, vector[1], (T[0, 1], T[1, 1], T[2, 1]))
-    return plus(y, vector[2], (T[0, 2], T[1, 2], T[2, 2]))
-
-
-@step
-def centre_of(rays: Rays, block: Index, car: Index) -> Point:
-    """Centre of a block's camera in the frame of its car."""
-    T, at = rays.T_obj_cam[car], rays.centre_cam[block]
-    return turned(rays, car, (T[0, 3], T[1, 3], T[2, 3]), (at[0], at[1], at[2]))
-
-
-@step
-def direction_of(rays: Rays, block: Index, row: Index, car: Index) -> Point:
-    """Direction of a ray, per metre of depth, in the frame of its car."""
-    return turned(rays, car, NOWHERE, point_in(rays.ray_cam, block, row))
-
-
-@step
-def write(out: Reals, block: Index, row: Index, point: Point) -> None:
-    """Write the coordinates of the point of a ray."""
-    out[0, block, row], out[1, block, row], out[2, block, row] = point
-
-
-@step
-def point_in(points: Reals, block: Index, row: Index) -> Point:
-    return points[0, block, row], points[1, block, row], points[2, block, row]
+def walk_for(num_rows: int) -> Walk:
+    row, three = np.empty(num_rows, np.float32), np.empty((3, num_rows), np.float32)
+    way, come, goes_on = np.empty_like(row), np.empty_like(row), np.empty(num_rows, np.bool_)
+    return Walk(row, np.empty_like(row), np.empty_like(row), way, come, goes_on, three, np.empty_like(three))
 
 
 @step
@@ -86,9 +77,8 @@ def interval(search: Search, margin: Real, centre: Point, direction: Point) -> t
     near, far = max(enters_x, enters_y, enters_z, ZERO), min(leaves_x, leaves_y, leaves_z)
     enters, leaves = (enters_x, enters_y, enters_z), (leaves_x, leaves_y, leaves_z)
     # `max` and `min` may pass over a NaN, which comes of a pose that is not finite.
-    if far > near and not (np.isnan(enters_x) or np.isnan(enters_y) or np.isnan(enters_z)):
-        return True, near, far, enters, leaves
-    return False, ONE, TWO, enters, leaves
+    crosses = (far > near) & (not np.isnan(enters_x)) & (not np.isnan(enters_y)) & (not np.isnan(enters_z))
+    return crosses, near if crosses else ONE, far if crosses else TWO, enters, leaves
 
 
 @step
@@ -112,66 +102,118 @@ def start_cell(grid: Grid, position: Real, along: Real, last: Real) -> Real:
 
 
 @step
-def minimum_along(
-    grid: Grid, first: Index, centre: Point, direction: Point, depth: Real, near: Real, far: Real, max_cells: int
-) -> tuple[Real, Point]:
-    """Depth and face of the least distance (`GridShape.minimum_along`)."""
-    dx, dy, dz = (
-        away_from_zero(direction[0] * grid.per_m, grid.no_step),
-        away_from_zero(direction[1] * grid.per_m, grid.no_step),
-        away_from_zero(direction[2] * grid.per_m, grid.no_step),
+def along_ray(grid: Grid, block: Block, row: int, start: Real) -> tuple[Point, Point]:
+    """Position on a ray at a depth, and its change per metre of depth, in cells; no component of it vanishes."""
+    d, per_m = at(block.direction, row), grid.per_m
+    along = (
+        away_from_zero(d[0] * per_m, grid.no_step),
+        away_from_zero(d[1] * per_m, grid.no_step),
+        away_from_zero(d[2] * per_m, grid.no_step),
     )
-    x, y, z = plus(position_of(grid, centre), depth, (dx, dy, dz))
+    return plus(position_of(grid, block.centre), start, along), along
+
+
+@step
+def enter(grid: Grid, block: Block, walk: Walk) -> None:
+    """Fetch the cells where the walks begin, and find out where downhill is."""
+    last, rows = grid.last, range(np.uint64(len(walk.start)))
+    for row in rows:
+        (x, y, z), (dx, dy, dz) = along_ray(grid, block, row, walk.start[row])
+        cell = start_cell(grid, x, dx, last[0]), start_cell(grid, y, dy, last[1]), start_cell(grid, z, dz, last[2])
+        put(walk.cell, row, cell)
+        put(block.place, row, (x - cell[0], y - cell[1], z - cell[2]))
+        block.node[row] = node_of(grid, cell)
+    fetch(grid, block)
+    for row in rows:
+        _, along = along_ray(grid, block, row, walk.start[row])
+        slope, _, _ = derivatives_along(corners_of(block, row), at(block.place, row), along)
+        walk.way[row] = ONE if slope < ZERO else -ONE
+        walk.come[row], walk.goes_on[row] = ZERO, True
+        put(walk.face, row, NOWHERE)
+
+
+@step
+def enter_next(grid: Grid, block: Block, walk: Walk) -> None:
+    """Fetch the cells behind the faces that the walks have reached."""
     last = grid.last
-    i, j, k = start_cell(grid, x, dx, last[0]), start_cell(grid, y, dy, last[1]), start_cell(grid, z, dz, last[2])
-    ux, uy, uz = x - i, y - j, z - k
-    slope, second, third = derivatives_along(grid, first, node_of(grid, (i, j, k)), (ux, uy, uz), (dx, dy, dz))
-    # Positions on the ray are measured downhill from here on.
-    way = ONE if slope < ZERO else -ONE
-    limit = max(way * (far - depth), way * (near - depth))
-    slope, third = -abs(slope), third * way
-    hx, hy, hz = dx * way, dy * way, dz * way
-    move_x, move_y, move_z = sign(hx), sign(hy), sign(hz)
-    to_x, to_y, to_z = (
-        (HALF + HALF * move_x - ux) / hx,
-        (HALF + HALF * move_y - uy) / hy,
-        (HALF + HALF * move_z - uz) / hz,
-    )
-    per_x, per_y, per_z = abs(ONE / hx), abs(ONE / hy), abs(ONE / hz)
-    come, face_x, face_y, face_z = ZERO, ZERO, ZERO, ZERO
-    for number in range(max_cells):
-        if number:
-            i = clamp(i + face_x * move_x, ZERO, last[0] - ONE)
-            j = clamp(j + face_y * move_y, ZERO, last[1] - ONE)
-            k = clamp(k + face_z * move_z, ZERO, last[2] - ONE)
-            ux, uy, uz = ux - face_x * move_x, uy - face_y * move_y, uz - face_z * move_z
-            to_x, to_y, to_z = to_x + face_x * per_x, to_y + face_y * per_y, to_z + face_z * per_z
-            place = ux + come * hx, uy + come * hy, uz + come * hz
-            slope, second, third = derivatives_along(grid, first, node_of(grid, (i, j, k)), place, (hx, hy, hz))
-            if slope > ZERO:
-                # The distance grows from the face on through which the ray came, so the minimum is a kink on it.
-                return depth + way * come, (face_x, face_y, face_z)
+    for row in range(np.uint64(len(walk.start))):
+        position, along = along_ray(grid, block, row, walk.start[row])
+        x, y, z = plus(position, walk.come[row] * walk.way[row], along)
+        (i, j, k), face, way = at(walk.cell, row), at(walk.face, row), walk.way[row]
+        cell = (
+            clamp(i + face[0] * sign(along[0]) * way, ZERO, last[0] - ONE),
+            clamp(j + face[1] * sign(along[1]) * way, ZERO, last[1] - ONE),
+            clamp(k + face[2] * sign(along[2]) * way, ZERO, last[2] - ONE),
+        )
+        put(walk.cell, row, cell)
+        put(block.place, row, (x - cell[0], y - cell[1], z - cell[2]))
+        block.node[row] = node_of(grid, cell)
+    fetch(grid, block)
+
+
+@step
+def to_face(cell: Real, position: Real, along: Real) -> Real:
+    """Distance from a position to the face through which a ray leaves a cell."""
+    return (cell + HALF + HALF * sign(along) - position) / along
+
+
+@step
+def advance(grid: Grid, block: Block, walk: Walk) -> None:
+    """Walk to the least distance in each cell, or to the face where the walk leaves it."""
+    for row in range(np.uint64(len(walk.start))):
+        start, way, come, goes_on = walk.start[row], walk.way[row], walk.come[row], walk.goes_on[row]
+        position, (dx, dy, dz) = along_ray(grid, block, row, start)
+        cell, along = at(walk.cell, row), (dx * way, dy * way, dz * way)
+        slope, second, third = derivatives_along(corners_of(block, row), at(block.place, row), along)
+        limit = max(way * (walk.far[row] - start), way * (walk.near[row] - start))
+        to_x, to_y, to_z = (
+            to_face(cell[0], position[0], along[0]),
+            to_face(cell[1], position[1], along[1]),
+            to_face(cell[2], position[2], along[2]),
+        )
         root, leaves = come + first_root(grid, slope, second, third), min(to_x, to_y, to_z)
-        come = min(root, leaves, limit)
-        if not (root > leaves and limit > leaves and limit > ZERO):
-            return depth + way * come, NOWHERE
-        face_x = ONE if leaves >= to_x else ZERO
-        face_y = ONE if leaves >= to_y else ZERO
-        face_z = ONE if leaves >= to_z else ZERO
-    return depth + way * come, (face_x, face_y, face_z)
+        # Where the distance grows from the face on through which the ray came, the minimum is a kink on that face.
+        moves = goes_on & (not slope > ZERO)
+        leaves_cell = moves & (root > leaves) & (limit > leaves) & (limit > ZERO)
+        walk.come[row], walk.goes_on[row] = min(root, leaves, limit) if moves else come, leaves_cell
+        reached, kept = (ONE if leaves_cell else ZERO), (ZERO if moves else ONE)
+        face = at(walk.face, row)
+        new = (
+            reached if leaves >= to_x else ZERO,
+            reached if leaves >= to_y else ZERO,
+            reached if leaves >= to_z else ZERO,
+        )
+        put(walk.face, row, plus(new, kept, face))
 
 
 @step
 def closest_from(
-    grid: Grid, search: Search, first: Index, centre: Point, direction: Point, start: Real, max_cells: int
-) -> tuple[bool, Real, Point]:
-    """Whether a ray crosses the bounds, and depth and face of its closest point near a start."""
-    crosses, near, far, enters, leaves = interval(search, search.margin_m, centre, direction)
-    if not crosses:
-        return False, near, NOWHERE
-    depth, face = minimum_along(grid, first, centre, direction, min(max(start, near), far), near, far, max_cells)
-    if depth <= near + search.at_end_m:
-        face = ONE - sign(near - enters[0]), ONE - sign(near - enters[1]), ONE - sign(near - enters[2])
-    if depth >= far - search.at_end_m:
-        face = ONE - sign(leaves[0] - far), ONE - sign(leaves[1] - far), ONE - sign(leaves[2] - far)
-    return True, depth, face
+    grid: Grid,
+    search: Search,
+    block: Block,
+    start: Reals,
+    max_cells: int,
+    walk: Walk,
+    crosses: Flags,
+    depth: Reals,
+    face: Points,
+) -> None:
+    """Write which rays cross the bounds, and depth and face of their closest points near a start."""
+    rows = range(np.uint64(len(start)))
+    for row in rows:
+        _, near, far, _, _ = interval(search, search.margin_m, block.centre, at(block.direction, row))
+        walk.near[row], walk.far[row], walk.start[row] = near, far, min(max(start[row], near), far)
+    enter(grid, block, walk)
+    advance(grid, block, walk)
+    for _ in range(1, max_cells):
+        enter_next(grid, block, walk)
+        advance(grid, block, walk)
+    for row in rows:
+        meets, near, far, enters, leaves = interval(search, search.margin_m, block.centre, at(block.direction, row))
+        least, on = walk.start[row] + walk.way[row] * walk.come[row], at(walk.face, row)
+        at_near = ONE - sign(near - enters[0]), ONE - sign(near - enters[1]), ONE - sign(near - enters[2])
+        at_far = ONE - sign(leaves[0] - far), ONE - sign(leaves[1] - far), ONE - sign(leaves[2] - far)
+        on = at_near if least <= near + search.at_end_m else on
+        on = at_far if least >= far - search.at_end_m else on
+        crosses[row], depth[row] = meets, least if meets else near
+        put(face, row, on if meets else NOWHERE)
