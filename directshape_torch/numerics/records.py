@@ -117,8 +117,9 @@ class TensorRecord(Record):
     def __post_init__(self) -> None:
         sizes: dict[int | str, int] = {}
         first: DeclaredTensor | None = None
+        specs = declared(self)
         for each in fields(self):  # type: ignore[arg-type]
-            name, value, spec = each.name, getattr(self, each.name), declared(self)[each.name]
+            name, value, spec = each.name, getattr(self, each.name), specs[each.name]
             if spec is None or (value is None and each.default is None):
                 continue
             spec.check(name, value, sizes)
@@ -129,12 +130,12 @@ class TensorRecord(Record):
     def in_dtype(self, dtype: torch.dtype) -> Self:
         """The record with its numbers, and the numbers of records inside it, in a dtype; masks keep their dtype."""
         changed: dict[str, Any] = {}
-        for each in fields(self):  # type: ignore[arg-type]
-            value, spec = getattr(self, each.name), declared(self)[each.name]
+        for name, spec in declared(self).items():
+            value = getattr(self, name)
             if isinstance(value, TensorRecord):
-                changed[each.name] = value.in_dtype(dtype)
+                changed[name] = value.in_dtype(dtype)
             elif value is not None and spec is not None and spec.kind in FOLLOWING:
-                changed[each.name] = value.to(dtype)
+                changed[name] = value.to(dtype)
         is_same = all(getattr(self, name) is value for name, value in changed.items())
         return self if is_same else replace(self, **changed)  # type: ignore[type-var]
 
