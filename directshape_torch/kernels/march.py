@@ -136,11 +136,11 @@ def write_start(search: Search, samples: Samples, start: Reals) -> None:
             start[row], least[row] = sdf[s, row] if less else start[row], np.float32(s) if less else least[row]
     last = np.uint64(len(sdf) - 1)
     for row in rows:
-        s = np.uint64(least[row])
-        start[row] = depth[s, row]
-        if np.uint64(0) < s < last:
-            before, after = s - np.uint64(1), s + np.uint64(1)
-            beside = vertex(sdf[before, row], sdf[s, row], sdf[after, row], HALF, search)
+        middle = np.uint64(least[row])
+        start[row] = depth[middle, row]
+        if np.uint64(0) < middle < last:
+            before, after = middle - np.uint64(1), middle + np.uint64(1)
+            beside = vertex(sdf[before, row], sdf[middle, row], sdf[after, row], HALF, search)
             start[row] += beside * (depth[1, row] - depth[0, row])
 
 
