@@ -71,10 +71,6 @@ class ResumeError(DirectShapeError):
     """An output folder was made by another configuration, prior or input than the present run."""
 
 
-class RunInProgressError(DirectShapeError):
-    """Another process is writing to the output folder."""
-
-
 class SceneWarning(UserWarning):
     """A refiner found a mistake in images, calibration, masks or boxes (setting `check`)."""
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.errors import DataFormatError
-from directshape_torch.files.atomic_files import write_bytes, write_png
+from directshape_torch.files.atomic_files import write_bytes, write_png, write_text
 from directshape_torch.files.mesh_files import T_GLTF_CAM
 from directshape_torch.geometry.box3d import alpha_from_kitti
 from directshape_torch.io.kitti_labels import KittiObject
@@ -29,6 +29,7 @@ from directshape_torch.io.result_files import (
 )
 from directshape_torch.io.run_folder import (
     FrameRecord,
+    failure_path,
     frame_entry,
     mesh_path,
     overlay_path,
@@ -185,6 +186,7 @@ def _numpy(tensor: Tensor) -> NDArray[Any]:
     return np.asarray(tensor.detach().cpu().numpy())
 
 
-def failed_entry(reason: str) -> FrameEntry:
-    """The entry of a frame that could not be refined."""
+def write_failure(out_dir: Path, frame_id: str, reason: str) -> FrameEntry:
+    """Write why a frame could not be refined, and return its entry in `summary.json`."""
+    write_text(failure_path(out_dir, frame_id), reason + "\n")
     return {"state": "failed", "reason": reason}

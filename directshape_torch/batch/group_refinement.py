@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import time
 from collections.abc import Iterator, Sequence
@@ -12,19 +13,25 @@ from pathlib import Path
 import torch
 
 from directshape_torch.batch.frame_groups import FrameGroup
-from directshape_torch.batch.frame_outputs import failed_entry, write_frame_outputs
+from directshape_torch.batch.frame_outputs import write_failure, write_frame_outputs
 from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.run_summary import RunTimings, peak_device_memory_mb, peak_memory_mb
 from directshape_torch.errors import CompilationError, DirectShapeError, MissingDependencyError
 from directshape_torch.io.frame_collation import collate, split_by_rig
-from directshape_torch.io.run_log import OutputLostError, writing_to
+from directshape_torch.io.run_folder import done_entry
 from directshape_torch.io.run_manifest import FrameEntry, hash_files
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 
+
+class OutputLostError(DirectShapeError):
+    """No more results can be written to the output folder."""
+
+
 # These errors affect every frame, so further frames would only fail too.
 STOPS_THE_RUN = (CompilationError, MissingDependencyError, OutputLostError)
+_DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
 @dataclass(frozen=True)
@@ -47,7 +54,6 @@ class GroupReport:
     ends: dict[str, FrameEntry]  # entries of `summary.json`, in the order in which frames ended
     timings: RunTimings = field(default_factory=RunTimings)  # times of the calls, and resources of this process so far
     num_halved: int = 0  # calls that failed and were repeated with half of the frames
-    stopped: str | None = None  # why no other frame could be refined either, or None
 
 
 # A loaded frame comes with the hashes of its files.
@@ -55,12 +61,19 @@ _Ready = tuple[LoadedFrame, dict[str, str]]
 
 
 def refine_group(job: RunJob, group: FrameGroup) -> GroupReport:
-    """Refine a group in this process; errors of a frame go to `ends`, errors of the whole run to `stopped`."""
-    step, cpu_start_s = _GroupStep(job, group), time.process_time()
+    """Refine the frames of a group that have no files yet, in this process; errors of a frame go to `ends`.
+
+    Raises:
+        DirectShapeError: no other frame could be refined either.
+    """
+    found = {frame_id: done_entry(job.out_dir, frame_id, job.run, job.options.outputs) for frame_id in group.wanted}
+    ends = {frame_id: entry for frame_id, entry in sorted(found.items()) if entry is not None}
+    step, cpu_start_s = _GroupStep(job, group.without(ends), ends), time.process_time()
     try:
         step.refine(group.frame_ids)
     except STOPS_THE_RUN as error:
-        step.report.stopped = _reason(error)
+        # Other processes may not be able to read errors of other classes.
+        raise DirectShapeError(_reason(error)) from error
     timings = step.report.timings
     timings.cpu_s = time.process_time() - cpu_start_s
     timings.peak_mb, timings.peak_device_mb = peak_memory_mb(), peak_device_memory_mb(timings.device)
@@ -70,9 +83,9 @@ def refine_group(job: RunJob, group: FrameGroup) -> GroupReport:
 class _GroupStep:
     """A `_GroupStep` is the refinement of one group."""
 
-    def __init__(self, job: RunJob, group: FrameGroup) -> None:
+    def __init__(self, job: RunJob, group: FrameGroup, ends: dict[str, FrameEntry]) -> None:
         self.job, self.group = job, group
-        self.report = GroupReport({}, RunTimings(job.refiner.prior.origin.device))
+        self.report = GroupReport(ends, RunTimings(job.refiner.prior.origin.device))
 
     def refine(self, frame_ids: Sequence[str]) -> None:
         """Refine frames together, or in halves after a failure, down to the single frame that is the cause."""
@@ -133,7 +146,7 @@ class _GroupStep:
     def _write(self, loaded: LoadedFrame, inputs: dict[str, str], result: RefinementResult) -> None:
         job = self.job
         try:
-            with writing_to(job.out_dir):
+            with _writing_to(job.out_dir):
                 entry = write_frame_outputs(job.out_dir, loaded, result, job.run, job.prior_sha256, inputs, job.options)
             self.report.ends[loaded.frame_id] = entry
         except STOPS_THE_RUN:
@@ -144,7 +157,31 @@ class _GroupStep:
     def _fail(self, frame_id: str, reason: str) -> None:
         # A frame that was finished before and only joined the group again stays finished.
         if frame_id in self.group.wanted:
-            self.report.ends[frame_id] = failed_entry(reason)
+            with _writing_to(self.job.out_dir):
+                self.report.ends[frame_id] = write_failure(self.job.out_dir, frame_id, reason)
+
+
+@contextmanager
+def _writing_to(out_dir: Path) -> Iterator[None]:
+    """Raise `OutputLostError` if the disk is full while the body runs."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _DISK_IS_FULL:
+            raise
+        raise OutputLostError(
+            f"cannot write to {out_dir} any more ({error.strerror or error}): make room there and run the same command "
+            "again; what is finished stays finished"
+        ) from error
+
+
+def set_threads(threads: int | None) -> None:
+    """Set the number of threads of PyTorch and OpenCV in this process; None leaves it unchanged."""
+    import cv2
+
+    if threads is not None:
+        torch.set_num_threads(threads)
+        cv2.setNumThreads(threads)
 
 
 @contextmanager
@@ -153,9 +190,7 @@ def limited_threads(threads: int | None) -> Iterator[None]:
     import cv2
 
     before = torch.get_num_threads(), cv2.getNumThreads()
-    if threads is not None:
-        torch.set_num_threads(threads)
-        cv2.setNumThreads(threads)
+    set_threads(threads)
     try:
         yield
     finally:

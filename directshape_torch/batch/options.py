@@ -27,10 +27,10 @@ class RefineOptions:
         batch_frames: number of frames refined together in one call.
         workers: number of parallel processes. None: only this process.
         threads: number of threads of each process. None: this process keeps its number, and a worker gets 1.
-        retries: how often frames whose worker died are tried again before they count as failed.
+        ray: address "HOST:PORT" of a cluster of Ray, whose processes are the workers (docs/many_machines.md).
 
     Raises:
-        InputError: an unknown mesh format, or a number that is too small.
+        InputError: an unknown mesh format, a number that is too small, or both `workers` and `ray`.
 
     Examples:
         >>> RefineOptions(meshes="ply").outputs
@@ -44,15 +44,17 @@ class RefineOptions:
     batch_frames: int = 1
     workers: int | None = None
     threads: int | None = None
-    retries: int = 1
+    ray: str | None = None
 
     def __post_init__(self) -> None:
         if self.meshes is not None and self.meshes not in get_args(MeshFormat):
             raise InputError("meshes", f"one of {', '.join(get_args(MeshFormat))}, or None", repr(self.meshes))
-        for name, least in (("batch_frames", 1), ("workers", 1), ("threads", 1), ("retries", 0)):
+        for name in ("batch_frames", "workers", "threads"):
             number = getattr(self, name)
-            if number is not None and number < least:
-                raise InputError(name, f"at least {least}", str(number))
+            if number is not None and number < 1:
+                raise InputError(name, "at least 1", str(number))
+        if self.ray is not None and self.workers is not None:
+            raise InputError("workers", "none with ray, whose nodes have them", str(self.workers))
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -63,7 +65,8 @@ class RefineOptions:
     @property
     def threads_per_worker(self) -> int | None:
         """The number of threads to set, or None to leave it unchanged."""
-        return 1 if self.workers is not None and self.threads is None else self.threads
+        has_workers = self.workers is not None or self.ray is not None
+        return 1 if has_workers and self.threads is None else self.threads
 
 
 class RunObserver:

@@ -7,23 +7,21 @@ import importlib.metadata
 import time
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import torch
-
+from directshape_torch.batch.engines import Engine, LocalEngine, reports_of
 from directshape_torch.batch.frame_groups import FrameGroup, frame_groups, track_windows
-from directshape_torch.batch.frame_outputs import failed_entry
+from directshape_torch.batch.frame_outputs import write_failure
 from directshape_torch.batch.group_refinement import GroupReport, RunJob, limited_threads, refine_group
 from directshape_torch.batch.options import RefineOptions, RunObserver
-from directshape_torch.batch.resumption import OUTPUT_FOLDERS, EarlierResults, remove_results, remove_unfinished_files
-from directshape_torch.batch.run_summary import RunSummary, RunTimings, find_warnings, write_timings
-from directshape_torch.batch.workers import LocalWorkers, reports_of
+from directshape_torch.batch.ray_engine import RayEngine
+from directshape_torch.batch.resumption import OUTPUT_FOLDERS, RunRecord, remove_results, remove_stale_files
+from directshape_torch.batch.run_summary import RunSummary, RunTimings, digit_warnings, find_warnings, write_timings
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.files.atomic_files import check_folder
 from directshape_torch.io.config_files import config_to_mapping
 from directshape_torch.io.result_files import read_shapes, write_tracks
-from directshape_torch.io.run_folder import done_frames, overlay_path, result_path, shapes_path
-from directshape_torch.io.run_log import RunBeginning, RunEvent, RunLog, digit_warnings, read_log
+from directshape_torch.io.run_folder import overlay_path, result_path, shapes_path
 from directshape_torch.io.run_manifest import RunManifest, SharedHashes, hash_fields, hash_prior
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.refinement.scene_problem import TermFactory
@@ -48,65 +46,66 @@ def refine_dataset(
     Args:
         dataset: the frames, in the dtype of the refiner.
         refiner: refiner on any device.
-        out_dir: folder of `data`, `shapes`, `summary.json`, `run.jsonl`, `timings.json` and the files that the options
-            ask for.
+        out_dir: folder of `data`, `shapes`, `summary.json`, `timings.json` and the files that the options ask for.
         options: kinds of outputs, frames in a call, number of processes. Default: this process only.
         observer: observer that is told of each frame.
         fresh: whether to remove files of earlier runs and start again.
 
     Raises:
         ResumeError: the folder has results of another configuration, prior or input.
-        RunInProgressError: another run writes to the folder.
-        InputError: `out_dir` is not a folder or would overwrite the detections, or a folder in it is a link.
+        InputError: `out_dir` is not a folder or would overwrite the detections, a folder in it is a link, or a cluster
+            of Ray cannot do the job.
         DirectShapeError: the run cannot continue, because the disk is full or workers die before they finish a frame.
     """
     out_dir, options = Path(out_dir), options or RefineOptions()
     check_out_dir(dataset, out_dir)
-    with RunLog(out_dir) as log, limited_threads(options.threads if options.workers is None else None):
-        remove_unfinished_files(out_dir)
+    manifest = run_manifest(dataset, refiner, options.batch_frames)
+    job = RunJob(dataset, refiner, out_dir, options, manifest.hash, manifest.sha256["prior"])
+    with contextlib.ExitStack() as stack:
+        engine: Engine | None = None
+        if options.ray is not None:
+            engine = stack.enter_context(RayEngine(job, options.ray))
+        elif options.workers is not None:
+            engine = stack.enter_context(LocalEngine(job, options.workers))
+        else:
+            stack.enter_context(limited_threads(options.threads))
+        remove_stale_files(out_dir)
         is_cleared = fresh and remove_results(out_dir)
-        manifest = run_manifest(dataset, refiner, options.batch_frames)
-        earlier = EarlierResults(out_dir, manifest, options.outputs, is_cleared)
-        job = RunJob(dataset, refiner, out_dir, options, manifest.hash, manifest.sha256["prior"])
-        return _Run(job, earlier, log, observer or RunObserver()).execute()
+        record = RunRecord(out_dir, manifest, options.outputs, is_cleared)
+        return _Run(job, record, engine, observer or RunObserver()).execute()
 
 
 class _Run:
     """A `_Run` is one run in the process that the user started."""
 
-    def __init__(self, job: RunJob, earlier: EarlierResults, log: RunLog, observer: RunObserver) -> None:
-        self.job, self.earlier, self.log, self.observer = job, earlier, log, observer
+    def __init__(self, job: RunJob, record: RunRecord, engine: Engine | None, observer: RunObserver) -> None:
+        self.job, self.record, self.engine, self.observer = job, record, engine, observer
         self.dataset, self.options, self.out_dir = job.dataset, job.options, job.out_dir
-        self.frames = earlier.manifest.frames
-        self.timings = RunTimings(job.refiner.prior.origin.device)
+        self.frames = record.manifest.frames
+        self.timings = RunTimings(job.refiner.prior.origin.device, batch_frames=job.options.batch_frames)
+        if engine is not None:
+            self.timings.threads, self.timings.workers = job.options.threads_per_worker or 1, engine.workers
         self.warnings: list[str] = []
         self.num_halved = 0
 
     def execute(self) -> RunSummary:
-        before, now = read_log(self.out_dir), RunBeginning(self._work(), len(self.dataset.frame_ids))
-        self.log.begin(now)
-        resumed: list[str] = []
-        try:
-            resumed += self.earlier.finished_frames(self.dataset)
-            groups = self._groups(resumed)
-            if groups and resumed and before is not None:
-                self.warnings += digit_warnings(before[0], now)
-            self.log.add(RunEvent(time.time(), resumed=len(resumed)))
-            self.observer.started([name for group in groups for name in group.frame_ids if name in group.wanted])
-            if groups:
-                self._refine(groups)
-        except BaseException as error:
-            # Finished frames stay finished. On a full disk even this fails, and the next run reads the files.
-            with contextlib.suppress(OSError, DirectShapeError):
-                # Workers may have finished frames that were not reported.
-                self.earlier.take_in(set(done_frames(self.out_dir)).intersection(self.dataset.frame_ids))
-                self._end(resumed, str(error) or type(error).__name__)
-            raise
+        resumed = self.record.finished_frames(self.dataset)
+        groups = self._groups(resumed)
+        if groups and resumed:
+            self.warnings += digit_warnings(self.out_dir, self.timings)
+        wanted = [name for group in groups for name in group.frame_ids if name in group.wanted]
+        self.observer.started(wanted)
+        if groups:
+            self.record.begin(wanted)
+            write_timings(self.out_dir, self.timings)
+            self._refine(groups)
+        self.record.gather()
         self._look_for_files()
         if has_tracks(self.dataset):
-            done = sorted(set(self.dataset.frame_ids).difference(self.earlier.manifest.failed))
+            done = sorted(set(self.dataset.frame_ids).difference(self.record.manifest.failed))
             self._write_tracks(done)
-        return self._end(resumed, None)
+        self.record.write()
+        return self._summary(resumed)
 
     def _groups(self, finished: Collection[str]) -> list[FrameGroup]:
         dataset, size = self.dataset, self.options.batch_frames
@@ -115,39 +114,27 @@ class _Run:
         return frame_groups(dataset.frame_ids, size, finished)
 
     def _refine(self, groups: Sequence[FrameGroup]) -> None:
-        start, options = time.perf_counter(), self.options
-        with contextlib.ExitStack() as stack:
-            reports: Iterator[GroupReport] = (refine_group(self.job, group) for group in groups)
-            if options.workers is not None:
-                self.timings.threads, self.timings.workers = options.threads_per_worker or 1, options.workers
-                workers = stack.enter_context(LocalWorkers(self.job, options.workers, options.threads_per_worker))
-                reports = reports_of(workers, groups, options.retries, self.earlier.entry)
-            try:
-                for report in reports:
-                    self._take_in(report)
-            finally:
-                self.timings.wall_s = time.perf_counter() - start
+        start = time.perf_counter()
+        reports: Iterator[GroupReport]
+        if self.engine is None:
+            reports = (refine_group(self.job, group) for group in groups)
+        else:
+            reports = reports_of(self.engine, self.job, groups)
+        try:
+            for report in reports:
+                self._take_in(report)
+        finally:
+            self.timings.wall_s = time.perf_counter() - start
+            # On a full disk this fails too, and the next run reads the files of the frames.
+            with contextlib.suppress(OSError):
+                write_timings(self.out_dir, self.timings)
 
     def _take_in(self, report: GroupReport) -> None:
         self.timings.add(report.timings)
         self.num_halved += report.num_halved
         for frame_id, entry in report.ends.items():
             self.frames[frame_id] = entry
-            self.log.add(RunEvent(time.time(), frame=frame_id, failure=entry.get("reason")))
             self.observer.finished(frame_id, entry.get("reason"))
-        if report.stopped is not None:
-            raise DirectShapeError(report.stopped)
-
-    def _end(self, resumed: Sequence[str], reason: str | None) -> RunSummary:
-        """Write the final state of the run, for every kind of end."""
-        if self.timings.calls:
-            write_timings(self.out_dir, self.timings)
-        self.earlier.write()
-        summary = self._summary(resumed)
-        end: Literal["finished", "stopped"] = "finished" if reason is None else "stopped"
-        num_done = len(summary.frames) - len(summary.failed)
-        self.log.add(RunEvent(time.time(), end=end, done=num_done, failed=summary.failed, reason=reason))
-        return summary
 
     def _write_tracks(self, frame_ids: Sequence[str]) -> None:
         frames = (read_shapes(shapes_path(self.out_dir, frame_id)) for frame_id in frame_ids)
@@ -157,16 +144,16 @@ class _Run:
     def _look_for_files(self) -> None:
         """Mark frames without files as failed, since every frame must have ended."""
         paths = [result_path, shapes_path, *([] if self.options.draw is None else [overlay_path])]
-        failed = self.earlier.manifest.failed
+        failed = self.record.manifest.failed
         for frame_id in self.dataset.frame_ids:
             if frame_id not in failed and not all(path(self.out_dir, frame_id).is_file() for path in paths):
                 reason = f"its files are not in {self.out_dir}: was the folder moved or emptied during the run?"
-                self.frames[frame_id] = failed_entry(reason)
+                self.frames[frame_id] = write_failure(self.out_dir, frame_id, reason)
 
     def _summary(self, resumed: Sequence[str]) -> RunSummary:
         frames = {frame_id: self.frames[frame_id] for frame_id in self.dataset.frame_ids if frame_id in self.frames}
         warnings = [*find_warnings(frames, sorted(self.dataset.classes)), *self.warnings]
-        if remade := self.earlier.remade:
+        if remade := self.record.remade:
             found = f"files of {len(remade)} finished frames were damaged or gone and made again"
             warnings.append(f"{found}: {_some(remade)}")
         if self.num_halved:
@@ -174,19 +161,8 @@ class _Run:
                 f"{self.num_halved} calls did not work with all of their frames and were halved: the last digits of "
                 "their results may differ from those of a run that has the memory"
             )
-        failed = {frame_id: reason for frame_id, reason in self.earlier.manifest.failed.items() if frame_id in frames}
+        failed = {frame_id: reason for frame_id, reason in self.record.manifest.failed.items() if frame_id in frames}
         return RunSummary(frames, tuple(resumed), failed, tuple(warnings), self.timings)
-
-    def _work(self) -> dict[str, Any]:
-        options = self.options
-        return {
-            "where": "this process" if options.workers is None else "processes",
-            "workers": options.workers or 1,
-            "threads": options.threads_per_worker or torch.get_num_threads(),
-            "device": self.timings.device.type,
-            "batch_frames": options.batch_frames,
-            "outputs": list(options.outputs),
-        }
 
 
 def _some(names: Sequence[str]) -> str:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+import time
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
@@ -14,10 +15,11 @@ from directshape_torch.batch.run_summary import TIMINGS
 from directshape_torch.errors import DataFormatError, ResumeError
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import (
+    done_entry,
     done_frames,
-    frame_entry,
+    failure_path,
     overlay_path,
-    read_done,
+    read_failure,
     read_record,
     result_path,
     shapes_path,
@@ -41,11 +43,16 @@ _Found = TypeVar("_Found")
 _READING_THREADS = 8
 _MESH = re.compile(r"(.+)_[0-9]{1,9}\.(ply|glb)")
 _TRACK = re.compile(r"(.+_)?[0-9]{6,}\.npz")
-OUTPUT_FOLDERS = ("data", "shapes", "meshes", "overlays", "tracks")
+OUTPUT_FOLDERS = ("data", "shapes", "meshes", "overlays", "tracks", "failed")
+# A file is written within moments, but clocks of machines differ.
+_STALE_S = 3600.0
 
 
-class EarlierResults:
-    """An `EarlierResults` has the results of earlier runs, which a run continues; else `ResumeError` is raised.
+class RunRecord:
+    """A `RunRecord` is the summary of a folder, which follows from the files of its frames.
+
+    Raises:
+        ResumeError: the folder has results of another configuration or prior.
 
     Attributes:
         manifest: manifest that includes the frames of earlier runs.
@@ -53,16 +60,10 @@ class EarlierResults:
     """
 
     def __init__(self, out_dir: Path, manifest: RunManifest, outputs: Sequence[str], is_cleared: bool = False) -> None:
-        self.out_dir, self.outputs = out_dir, outputs
+        self.out_dir, self.outputs, self.manifest = out_dir, outputs, manifest
         self.remade: list[str] = []
-        previous = read_manifest(summary_path(out_dir))
-        if previous is not None:
-            check_resume(previous, manifest)
-            manifest.frames.update(previous.frames)
-        elif not is_cleared:
+        if not self._takes_in_summary() and not is_cleared:
             self._check_empty()
-        self.manifest = manifest
-        self.write()
 
     def finished_frames(self, dataset: StereoDataset) -> list[str]:
         """Frames of the data set that need no work, because all outputs are complete and belong to the current inputs.
@@ -73,33 +74,55 @@ class EarlierResults:
         frames, done = self.manifest.frames, set(done_frames(self.out_dir))
         known = [f for f in dataset.frame_ids if f in done or (f in frames and frames[f]["state"] == "done")]
         checked = _in_threads(partial(self._checked, dataset), known)
-        # The summary also keeps finished frames that are not chosen now.
-        self.take_in(done.difference(dataset.frame_ids))
         found = {frame_id: entry for frame_id, (entry, _) in checked.items() if entry is not None}
         self.remade = [frame_id for frame_id, (_, is_damaged) in checked.items() if is_damaged]
         for frame_id in self.remade:
-            frames.pop(frame_id, None)
             with suppress(OSError):
                 result_path(self.out_dir, frame_id).unlink()
         frames.update(found)
         return list(found)
 
-    def take_in(self, frame_ids: Iterable[str]) -> None:
-        """Add finished frames to the summary that are not recorded there."""
-        frames = self.manifest.frames
-        unknown = sorted(f for f in frame_ids if f not in frames or frames[f]["state"] == "failed")
-        entries = _in_threads(self.entry, unknown)
-        frames.update({frame_id: entry for frame_id, entry in entries.items() if entry is not None})
+    def begin(self, frame_ids: Sequence[str]) -> None:
+        """Write the summary with frames that wait, and remove the reasons why they have failed before."""
+        self.manifest.frames.update({frame_id: {"state": "waiting"} for frame_id in frame_ids})
+        waiting = set(frame_ids)
+        for path in (self.out_dir / "failed").glob("*.txt"):
+            if path.stem in waiting:
+                path.unlink()
+        self.write()
 
-    def entry(self, frame_id: str) -> FrameEntry | None:
-        """The entry of a frame that has all outputs of this run, unchanged, else None."""
-        with suppress(DataFormatError):
-            return frame_entry(*read_done(self.out_dir, frame_id, self.manifest.hash, self.outputs))
-        return None
+    def gather(self) -> None:
+        """Add what the files in the folder say, also those of other runs into it.
+
+        Raises:
+            ResumeError: another run has begun in the folder, with other settings.
+        """
+        self._takes_in_summary()
+        frames = self.manifest.frames
+        is_done = {name for name, entry in frames.items() if entry["state"] == "done"}
+        unknown = [frame_id for frame_id in done_frames(self.out_dir) if frame_id not in is_done]
+        entries = _in_threads(self._entry, unknown)
+        frames.update({frame_id: entry for frame_id, entry in entries.items() if entry is not None})
+        for name, entry in frames.items():
+            if entry["state"] == "waiting" and failure_path(self.out_dir, name).is_file():
+                frames[name] = {"state": "failed", "reason": read_failure(self.out_dir, name)}
 
     def write(self) -> None:
         """Write `summary.json`."""
         write_manifest(summary_path(self.out_dir), self.manifest)
+
+    def _takes_in_summary(self) -> bool:
+        """Take in the frames of the summary in the folder, and say whether there is one."""
+        previous = read_manifest(summary_path(self.out_dir))
+        if previous is None:
+            return False
+        check_resume(previous, self.manifest)
+        for frame_id, entry in previous.frames.items():
+            self.manifest.frames.setdefault(frame_id, entry)
+        return True
+
+    def _entry(self, frame_id: str) -> FrameEntry | None:
+        return done_entry(self.out_dir, frame_id, self.manifest.hash, self.outputs)
 
     def _checked(self, dataset: StereoDataset, frame_id: str) -> tuple[FrameEntry | None, bool]:
         """The entry of a finished frame, or None, and whether an unfinished frame has lost files."""
@@ -115,7 +138,7 @@ class EarlierResults:
                 f"cannot resume: frame {frame_id} was refined from a file that is gone: {error}; {RESUME_CURE}"
             ) from error
         check_mapping(f"frame {frame_id}: sha256 of", record.inputs, hashes)
-        entry = self.entry(frame_id)
+        entry = self._entry(frame_id)
         return entry, entry is None and set(self.outputs) <= set(record.outputs)
 
     def _check_empty(self) -> None:
@@ -133,11 +156,13 @@ def _in_threads(read: Callable[[str], _Found], frame_ids: Sequence[str]) -> dict
         return dict(zip(frame_ids, threads.map(read, frame_ids), strict=True))
 
 
-def remove_unfinished_files(out_dir: Path) -> None:
-    """Remove temporary files of killed processes; the caller must hold the folder's lock."""
+def remove_stale_files(out_dir: Path) -> None:
+    """Remove temporary files of killed processes; files of the last hour may belong to another run that is at work."""
     for folder in (out_dir, *(out_dir / name for name in OUTPUT_FOLDERS)):
         for path in folder.glob(".*.tmp"):
-            path.unlink(missing_ok=True)
+            with suppress(FileNotFoundError):  # the other run has just moved it to its name
+                if path.stat().st_mtime < time.time() - _STALE_S:
+                    path.unlink()
 
 
 def remove_results(out_dir: Path) -> bool:
@@ -147,7 +172,7 @@ def remove_results(out_dir: Path) -> bool:
         return False
     frame_ids = {*previous.frames, *done_frames(out_dir)}
     for frame_id in frame_ids:
-        for path_of in (result_path, shapes_path, overlay_path):
+        for path_of in (result_path, shapes_path, overlay_path, failure_path):
             path_of(out_dir, frame_id).unlink(missing_ok=True)
     for mesh in (out_dir / "meshes").glob("*"):
         if (found := _MESH.fullmatch(mesh.name)) is not None and found[1] in frame_ids:

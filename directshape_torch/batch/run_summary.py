@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import platform
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_json
+from directshape_torch.files.read_files import read_json
 from directshape_torch.status import Status, counted
 
 TIMINGS = "timings.json"
-TIMINGS_SCHEMA_VERSION = 1
+TIMINGS_SCHEMA_VERSION = 2
 _CPU = torch.device("cpu")
 # A warning names at most this many cars without a mask.
 _NAMED = 3
+_PACKAGES = ("directshape_torch", "torch", "numpy", "opencv-python-headless", "scipy")
+# The last digits of a result depend on these entries of `timings.json`.
+_DIGITS = ("versions", "threads", "batch_frames", "device")
 
 
 @dataclass(frozen=True)
@@ -40,6 +47,7 @@ class RunTimings:
     calls: list[CallTiming] = field(default_factory=list)  # one entry for each call
     workers: int = 1  # parallel processes
     threads: int = field(default_factory=torch.get_num_threads)  # of each process
+    batch_frames: int = 1  # frames in a call
     cpu_s: float = 0.0  # processor time for the frames, in all workers, including reading and writing
     wall_s: float = 0.0  # seconds from the first frame to the last, including reading and writing
     peak_mb: float | None = None  # the largest resident memory of any of these processes, MB, if the system reports it
@@ -79,13 +87,41 @@ class RunTimings:
         return self.ms_per(self.num_frames)
 
 
+def versions() -> dict[str, str]:
+    """The versions of Python and of the packages that compute."""
+    found = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        with suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    return found
+
+
+def digit_warnings(out_dir: Path, timings: RunTimings) -> list[str]:
+    """Warnings about differences from the previous run that may change the last digits of further results."""
+    before, now = {}, _content(timings)
+    # Results do not need this file, so one that is missing or damaged is no reason to stop.
+    with suppress(DataFormatError):
+        before = read_json(out_dir / TIMINGS)
+    return [
+        f"{name}: {before[name]} in the previous run, {now[name]} now; the last digits of results may differ"
+        for name in _DIGITS
+        if isinstance(before, dict) and before.get(name, now[name]) != now[name]
+    ]
+
+
 def write_timings(out_dir: Path, timings: RunTimings) -> None:
-    """Write `timings.json` (schema 1), a separate file, so that all other files are the same in every run."""
-    content = {
+    """Write `timings.json` (schema 2), a separate file, so that all other files are the same in every run."""
+    write_json(out_dir / TIMINGS, _content(timings))
+
+
+def _content(timings: RunTimings) -> dict[str, Any]:
+    return {
         "schema_version": TIMINGS_SCHEMA_VERSION,
+        "versions": versions(),
         "device": device_name(timings.device),
         "workers": timings.workers,
         "threads": timings.threads,
+        "batch_frames": timings.batch_frames,
         "peak_memory_mb": timings.peak_mb,
         "peak_device_memory_mb": timings.peak_device_mb,
         "wall_s": _rounded(timings.wall_s),
@@ -97,7 +133,6 @@ def write_timings(out_dir: Path, timings: RunTimings) -> None:
             for call in timings.calls
         ],
     }
-    write_json(out_dir / TIMINGS, content)
 
 
 def device_name(device: torch.device) -> str:

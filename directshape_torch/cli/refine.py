@@ -17,6 +17,7 @@ from typing import get_args
 from directshape_torch.batch.group_refinement import limited_threads
 from directshape_torch.batch.learn_detector import learn_detector
 from directshape_torch.batch.options import MeshFormat, RefineOptions
+from directshape_torch.batch.ray_engine import check_cluster
 from directshape_torch.batch.refine_dataset import check_out_dir, refine_dataset
 from directshape_torch.batch.run_summary import format_summary
 from directshape_torch.cli.options import (
@@ -95,7 +96,7 @@ def _add_workers(group: argparse._ArgumentGroup) -> None:
         help="of the CPU, for each worker (default: 1; several stand still where other programs share the cores)",
     )
     group.add_argument(
-        "--retries", type=int, default=1, metavar="N", help="for frames whose worker died (default: %(default)s)"
+        "--ray", metavar="HOST:PORT", help="a cluster whose nodes are the workers (docs/many_machines.md)"
     )
 
 
@@ -104,12 +105,14 @@ def run(args: argparse.Namespace) -> int:
     default_frames = _TRACK_FRAMES if args.tracks else 1
     batch_frames = default_frames if args.batch_frames is None else args.batch_frames
     draw = overlay_of_frame if args.overlays else None
-    options = RefineOptions(args.meshes, draw, batch_frames, args.workers, args.threads, args.retries)
+    options = RefineOptions(args.meshes, draw, batch_frames, args.workers, args.threads, args.ray)
     extra = [] if args.lidar is None else [LidarPoints()]
     exact = ["rig.disparity_sigma_px=0"] if args.rig == "none" else []
     settings = [*exact, *args.set]
     # The data set is checked below, so the calls need no check.
     refiner = make_refiner(args.config, [*settings, "check=off"], args.prior, args.device, extra)
+    if options.ray is not None:
+        check_cluster(options.ray, refiner.prior.origin.device)
     if args.disparity is not None and not refiner.config.fits_points:
         raise InputError(
             "--disparity", "settings that fit points", "point_cloud.weight 0", "add --config geometric or combined"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import InputError
+
+# A path has one slash where a URL has two, and a single letter is a drive of Windows.
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 
 
 def write_bytes(path: Path | str, content: bytes, durable: bool = False) -> None:
@@ -58,7 +62,9 @@ def replaced_file(path: Path | str) -> Iterator[IO[bytes]]:
 
 
 def check_folder(name: str, path: Path) -> None:
-    """Raise `InputError` if a folder cannot be created, because a file or broken link is in its path."""
+    """Raise `InputError` if a folder cannot be created: a file or broken link is in its path, or it is a URL."""
+    if _URL.match(str(path)):
+        raise InputError(name, "a folder of a file system", str(path), "mount it, and give the folder where it is")
     existing = next(each for each in (path, *path.parents) if each.exists() or each.is_symlink())
     if not existing.is_dir():
         kind = "file" if existing.exists() else "broken link"

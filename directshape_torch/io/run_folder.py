@@ -10,6 +10,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,11 @@ def shapes_path(out_dir: Path | str, frame_id: str) -> Path:
 def overlay_path(out_dir: Path | str, frame_id: str) -> Path:
     """The picture of a frame."""
     return Path(out_dir) / "overlays" / f"{frame_id}.png"
+
+
+def failure_path(out_dir: Path | str, frame_id: str) -> Path:
+    """The file with the reason why a frame could not be refined."""
+    return Path(out_dir) / "failed" / f"{frame_id}.txt"
 
 
 def mesh_path(out_dir: Path | str, frame_id: str, line_number: int, mesh_format: str) -> Path:
@@ -113,6 +119,18 @@ def read_done(
         if record.files.get(name) != hash_bytes(read_bytes(out_dir / name)):
             raise DataFormatError(out_dir / name, f"has been changed, or does not belong to {path}", cure=_AGAIN)
     return shapes, record
+
+
+def done_entry(out_dir: Path, frame_id: str, run: str, outputs: Iterable[str]) -> FrameEntry | None:
+    """The entry of `summary.json` for a frame for which `read_done` raises no error, else None."""
+    with suppress(DataFormatError):
+        return frame_entry(*read_done(out_dir, frame_id, run, outputs))
+    return None
+
+
+def read_failure(out_dir: Path, frame_id: str) -> str:
+    """The reason why a frame could not be refined."""
+    return read_bytes(failure_path(out_dir, frame_id)).decode(errors="replace").strip()
 
 
 def frame_entry(shapes: ShapeArrays, record: FrameRecord) -> FrameEntry:

@@ -45,11 +45,11 @@ class SharedHashes(TypedDict):
 
 class _FrameState(TypedDict):
     # This key has a class of its own, because `Required` in a string annotation is ignored at run time.
-    state: Literal["done", "failed"]
+    state: Literal["waiting", "done", "failed"]
 
 
 class FrameEntry(_FrameState, total=False):
-    """A `FrameEntry` describes one frame in `frames`; a failed frame has only `reason`, others have the rest."""
+    """A `FrameEntry` describes one frame in `frames`; a failed frame has `reason`, a frame that is done the rest."""
 
     reason: str
     lines: int

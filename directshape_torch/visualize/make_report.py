@@ -14,7 +14,6 @@ from directshape_torch.errors import InputError
 from directshape_torch.files.atomic_files import replaced_file
 from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.run_folder import RunFolder
-from directshape_torch.io.run_log import read_log
 from directshape_torch.io.run_manifest import flatten, hash_fields
 from directshape_torch.io.run_status import read_status
 from directshape_torch.refinement.trust import WORSE_BY
@@ -109,11 +108,8 @@ def _notes(inputs: RunInputs, num_detailed: int) -> list[str]:
 
 def _unfinished(out_dir: Path) -> list[str]:
     """A note on the state of the run if it has not finished."""
-    if read_log(out_dir) is None:
-        return []
-    status = read_status(out_dir)
-    left = f"{status.state}, {status.num_left} frames left"
-    return [] if status.state == "finished" else [f"the run has not finished ({left}): the page is of what is done"]
+    left = read_status(out_dir).num_left
+    return [f"the run has not finished ({left} frames left): the page is of what is done"] if left else []
 
 
 def _run_facts(

@@ -22,6 +22,7 @@ from helpers.shape_arrays import shape_arrays
 from helpers.synthetic_scene import cached_street
 
 from directshape_torch import load_config
+from directshape_torch.batch.run_summary import RunTimings, digit_warnings
 from directshape_torch.cli.fit_shape import read_boxes
 from directshape_torch.errors import MeshError
 from directshape_torch.files.mesh_files import MESH_SUFFIXES, read_mesh
@@ -203,6 +204,7 @@ def _runs(root: Path, out: Path) -> dict[str, Sample]:
         "summary": Sample(out / "summary.json", resumed),
         "results": Sample(out / "summary.json", lambda: RunFolder(out)),
         "report": Sample(out / "summary.json", report),
-        "run": Sample(out / "run.jsonl", lambda: format_status(read_status(out)), is_exact=False),
+        "status": Sample(out / "summary.json", lambda: format_status(read_status(out))),
+        "times": Sample(out / "timings.json", lambda: digit_warnings(out, RunTimings()), is_exact=False),
         "results of a frame": Sample(out / "shapes" / f"{FRAME}.npz", lambda: RunFolder(out).read(FRAME)),
     }

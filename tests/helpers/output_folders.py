@@ -10,5 +10,5 @@ def result_files(folder: Path) -> dict[str, bytes]:
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.name not in ("timings.json", "run.jsonl")
+        if path.is_file() and path.name != "timings.json"
     }

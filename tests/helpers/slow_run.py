@@ -1,4 +1,4 @@
-"""This program runs two slow workers for a test that kills it: slow_run.py ROOT OUT."""
+"""This program runs slow workers for a test that kills it, two of them or those of Ray: slow_run.py ROOT OUT [RAY]."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from directshape_torch.io.stereo_dataset import open_dataset
 from helpers.faulty_refiners import SlowRefiner
 
 
-def main(root: Path, out_dir: Path) -> None:
+def main(root: Path, out_dir: Path, ray: str | None = None) -> None:
     dataset = open_dataset("kitti", root, root / "detections", root / "masks")
-    refine_dataset(dataset, SlowRefiner(root), out_dir, RefineOptions(workers=2))
+    refine_dataset(dataset, SlowRefiner(root), out_dir, RefineOptions(workers=2 if ray is None else None, ray=ray))
 
 
 if __name__ == "__main__":
     # A shell that starts tests in the background lets them ignore it.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]), *sys.argv[3:])

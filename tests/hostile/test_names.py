@@ -11,9 +11,8 @@ import pytest
 from helpers.quick_runs import dataset, refine, refiner
 
 from directshape_torch.batch.refine_dataset import refine_dataset
-from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
+from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io.instance_masks import InstanceMask, within_memory
-from directshape_torch.io.run_log import RunLog, log_path
 from directshape_torch.visualize.drawing import draw_text
 
 
@@ -46,25 +45,7 @@ def test_records_that_climb(shared_kitti: Path, tmp_path: Path) -> None:
     assert foreign.read_text() == "mine"
 
 
-def test_the_lock_follows_no_link(tmp_path: Path) -> None:
-    foreign = tmp_path / "foreign"
-    foreign.write_text("mine")
-    log_path(tmp_path).symlink_to(foreign)
-    with pytest.raises(DirectShapeError, match=r"run\.jsonl"), RunLog(tmp_path):
-        pass
-    assert foreign.read_text() == "mine"
-
-
-def test_the_lock_is_a_regular_file(tmp_path: Path) -> None:
-    os.mkfifo(log_path(tmp_path))
-    with (
-        pytest.raises(DataFormatError, match=r"run\.jsonl: cannot be written \(it is no regular file\)"),
-        RunLog(tmp_path),
-    ):
-        pass
-
-
-@pytest.mark.parametrize("name", ["data", "shapes", "overlays", "meshes", "tracks"])
+@pytest.mark.parametrize("name", ["data", "shapes", "overlays", "meshes", "tracks", "failed"])
 def test_a_folder_of_results_that_is_a_link(shared_kitti: Path, tmp_path: Path, name: str) -> None:
     foreign = tmp_path / "foreign"
     foreign.mkdir()

@@ -37,24 +37,26 @@ def undisturbed(shared_kitti: Path, tmp_path_factory: pytest.TempPathFactory) ->
     return out
 
 
-def test_workers_that_are_killed_as_they_start(shared_kitti: Path, tmp_path: Path, undisturbed: Path) -> None:
+@pytest.mark.parametrize("delay_s", [0.0, 0.7])
+def test_a_worker_that_is_killed_as_it_starts(
+    shared_kitti: Path, tmp_path: Path, undisturbed: Path, delay_s: float
+) -> None:
     """Before they have read the job, which is larger than a pipe holds."""
     killed: list[int] = []
 
     def kill() -> None:
-        for delay_s in (0.0, 0.7):
-            while not (found := [child for child in multiprocessing.active_children() if child.pid not in killed]):
-                time.sleep(0.01)
-            time.sleep(delay_s)
-            assert found[0].pid is not None
-            killed.append(found[0].pid)
-            os.kill(found[0].pid, signal.SIGKILL)
+        while not (found := multiprocessing.active_children()):
+            time.sleep(0.01)
+        time.sleep(delay_s)
+        assert found[0].pid is not None
+        killed.append(found[0].pid)
+        os.kill(found[0].pid, signal.SIGKILL)
 
     killer = threading.Thread(target=kill, daemon=True)
     killer.start()
-    summary = refine(shared_kitti, tmp_path / "out", workers=1, retries=2)
+    summary = refine(shared_kitti, tmp_path / "out", workers=1)
     killer.join()
-    assert (len(killed), summary.exit_code) == (2, 0)
+    assert (len(killed), summary.exit_code) == (1, 0)
     assert result_files(tmp_path / "out") == result_files(undisturbed)
 
 
@@ -127,11 +129,10 @@ def test_frames_of_records_that_no_run_has_written(
     assert result_files(out) == result_files(undisturbed)
 
 
-@pytest.mark.parametrize("name", ["run.jsonl", "summary.json"])
 @pytest.mark.parametrize("content", ["7", "[]", '{"schema_version": 1}', '{"schema_version": [[]]}'])
-def test_records_of_other_programs(shared_kitti: Path, tmp_path: Path, name: str, content: str) -> None:
-    (tmp_path / name).write_text(content)
-    with pytest.raises((DataFormatError, directshape_torch.ResumeError), match=name):
+def test_records_of_other_programs(shared_kitti: Path, tmp_path: Path, content: str) -> None:
+    (tmp_path / "summary.json").write_text(content)
+    with pytest.raises((DataFormatError, directshape_torch.ResumeError), match=r"summary\.json"):
         refine(shared_kitti, tmp_path)
 
 
@@ -151,5 +152,4 @@ def test_a_run_that_is_asked_to_end_says_so(tmp_path: Path) -> None:
     finally:
         run.kill()
     assert (run.returncode, said.splitlines()[-1]) == (143, "directshape: terminated")
-    status = read_status(out)
-    assert (status.state, status.reason) == ("stopped", "SIGTERM")
+    assert read_status(out).num_left > 0

@@ -91,7 +91,7 @@ def test_the_demo_writes_the_same_files(found: dict[str, Any]) -> None:
     demo = _of(found, "demo")
     assert len(demo["names"]) > 5
     # These name the device, and what it took.
-    assert demo["differ"] == ["run.jsonl", "timings.json"]
+    assert demo["differ"] == ["timings.json"]
 
 
 def test_the_page_for_a_card_has_results_gradients_and_times(found: dict[str, Any]) -> None:
