@@ -28,6 +28,7 @@ from directshape_torch.io.result_files import (
     write_shapes,
 )
 from directshape_torch.io.run_folder import (
+    FrameEntry,
     FrameRecord,
     failure_path,
     frame_entry,
@@ -37,7 +38,7 @@ from directshape_torch.io.run_folder import (
     result_path,
     shapes_path,
 )
-from directshape_torch.io.run_manifest import FrameEntry, hash_bytes
+from directshape_torch.io.run_manifest import hash_bytes
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refinement.result import KittiBoxes, RefinementResult
 from directshape_torch.status import Status
@@ -58,7 +59,7 @@ def write_frame_outputs(
     """Write the files that the options ask for; shapes come last, so that their existence marks a complete frame.
 
     `run`, `prior_sha256` and `inputs` are hashes of the manifest, of the shape prior and of the frame's input files.
-    The result is the frame's entry in `summary.json`.
+    The result is the frame's entry.
     """
     path = shapes_path(out_dir, loaded.frame_id)
     earlier = _earlier_record(path, run, inputs)
@@ -187,6 +188,6 @@ def _numpy(tensor: Tensor) -> NDArray[Any]:
 
 
 def write_failure(out_dir: Path, frame_id: str, reason: str) -> FrameEntry:
-    """Write why a frame could not be refined, and return its entry in `summary.json`."""
+    """Write why a frame could not be refined, and return its entry."""
     write_text(failure_path(out_dir, frame_id), reason + "\n")
-    return {"state": "failed", "reason": reason}
+    return {"reason": reason}

@@ -18,8 +18,8 @@ from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.run_summary import RunTimings, peak_device_memory_mb, peak_memory_mb
 from directshape_torch.errors import CompilationError, DirectShapeError, MissingDependencyError
 from directshape_torch.io.frame_collation import collate, split_by_rig
-from directshape_torch.io.run_folder import done_entry
-from directshape_torch.io.run_manifest import FrameEntry, hash_files
+from directshape_torch.io.run_folder import FrameEntry, done_entry
+from directshape_torch.io.run_manifest import hash_files
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
@@ -51,7 +51,7 @@ class RunJob:
 class GroupReport:
     """A `GroupReport` says how the frames of a group ended."""
 
-    ends: dict[str, FrameEntry]  # entries of `summary.json`, in the order in which frames ended
+    ends: dict[str, FrameEntry]  # in the order in which frames ended
     timings: RunTimings = field(default_factory=RunTimings)  # times of the calls, and resources of this process so far
     num_halved: int = 0  # calls that failed and were repeated with half of the frames
 

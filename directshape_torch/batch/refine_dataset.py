@@ -15,13 +15,21 @@ from directshape_torch.batch.frame_outputs import write_failure
 from directshape_torch.batch.group_refinement import GroupReport, RunJob, limited_threads, refine_group
 from directshape_torch.batch.options import RefineOptions, RunObserver
 from directshape_torch.batch.ray_engine import RayEngine
-from directshape_torch.batch.resumption import OUTPUT_FOLDERS, RunRecord, remove_results, remove_stale_files
+from directshape_torch.batch.resumption import (
+    OUTPUT_FOLDERS,
+    check_folder_of,
+    finished_frames,
+    forget_failures,
+    join_summary,
+    remove_results,
+    remove_stale_files,
+)
 from directshape_torch.batch.run_summary import RunSummary, RunTimings, digit_warnings, find_warnings, write_timings
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.files.atomic_files import check_folder
 from directshape_torch.io.config_files import config_to_mapping
 from directshape_torch.io.result_files import read_shapes, write_tracks
-from directshape_torch.io.run_folder import overlay_path, result_path, shapes_path
+from directshape_torch.io.run_folder import FrameEntry, overlay_path, result_path, shapes_path
 from directshape_torch.io.run_manifest import RunManifest, SharedHashes, hash_fields, hash_prior
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.refinement.scene_problem import TermFactory
@@ -71,40 +79,43 @@ def refine_dataset(
             stack.enter_context(limited_threads(options.threads))
         remove_stale_files(out_dir)
         is_cleared = fresh and remove_results(out_dir)
-        record = RunRecord(out_dir, manifest, options.outputs, is_cleared)
-        return _Run(job, record, engine, observer or RunObserver()).execute()
+        check_folder_of(out_dir, manifest, is_cleared)
+        return _Run(job, engine, observer or RunObserver()).execute(manifest)
 
 
 class _Run:
     """A `_Run` is one run in the process that the user started."""
 
-    def __init__(self, job: RunJob, record: RunRecord, engine: Engine | None, observer: RunObserver) -> None:
-        self.job, self.record, self.engine, self.observer = job, record, engine, observer
+    def __init__(self, job: RunJob, engine: Engine | None, observer: RunObserver) -> None:
+        self.job, self.engine, self.observer = job, engine, observer
         self.dataset, self.options, self.out_dir = job.dataset, job.options, job.out_dir
-        self.frames = record.manifest.frames
+        self.ends: dict[str, FrameEntry] = {}
         self.timings = RunTimings(job.refiner.prior.origin.device, batch_frames=job.options.batch_frames)
         if engine is not None:
             self.timings.threads, self.timings.workers = job.options.threads_per_worker or 1, engine.workers
         self.warnings: list[str] = []
         self.num_halved = 0
 
-    def execute(self) -> RunSummary:
-        resumed = self.record.finished_frames(self.dataset)
+    def execute(self, manifest: RunManifest) -> RunSummary:
+        resumed, damaged = finished_frames(self.out_dir, self.dataset, self.job.run, self.options.outputs)
+        self.ends.update(resumed)
+        if damaged:
+            found = f"files of {len(damaged)} finished frames were damaged or gone and made again"
+            self.warnings.append(f"{found}: {_some(damaged)}")
         groups = self._groups(resumed)
         if groups and resumed:
             self.warnings += digit_warnings(self.out_dir, self.timings)
         wanted = [name for group in groups for name in group.frame_ids if name in group.wanted]
         self.observer.started(wanted)
+        join_summary(self.out_dir, manifest)
         if groups:
-            self.record.begin(wanted)
+            forget_failures(self.out_dir, wanted)
             write_timings(self.out_dir, self.timings)
             self._refine(groups)
-        self.record.gather()
         self._look_for_files()
         if has_tracks(self.dataset):
-            done = sorted(set(self.dataset.frame_ids).difference(self.record.manifest.failed))
-            self._write_tracks(done)
-        self.record.write()
+            self._write_tracks(sorted(name for name, entry in self.ends.items() if "reason" not in entry))
+        join_summary(self.out_dir, manifest)
         return self._summary(resumed)
 
     def _groups(self, finished: Collection[str]) -> list[FrameGroup]:
@@ -133,7 +144,7 @@ class _Run:
         self.timings.add(report.timings)
         self.num_halved += report.num_halved
         for frame_id, entry in report.ends.items():
-            self.frames[frame_id] = entry
+            self.ends[frame_id] = entry
             self.observer.finished(frame_id, entry.get("reason"))
 
     def _write_tracks(self, frame_ids: Sequence[str]) -> None:
@@ -144,24 +155,20 @@ class _Run:
     def _look_for_files(self) -> None:
         """Mark frames without files as failed, since every frame must have ended."""
         paths = [result_path, shapes_path, *([] if self.options.draw is None else [overlay_path])]
-        failed = self.record.manifest.failed
-        for frame_id in self.dataset.frame_ids:
-            if frame_id not in failed and not all(path(self.out_dir, frame_id).is_file() for path in paths):
+        for frame_id, entry in self.ends.items():
+            if "reason" not in entry and not all(path(self.out_dir, frame_id).is_file() for path in paths):
                 reason = f"its files are not in {self.out_dir}: was the folder moved or emptied during the run?"
-                self.frames[frame_id] = write_failure(self.out_dir, frame_id, reason)
+                self.ends[frame_id] = write_failure(self.out_dir, frame_id, reason)
 
-    def _summary(self, resumed: Sequence[str]) -> RunSummary:
-        frames = {frame_id: self.frames[frame_id] for frame_id in self.dataset.frame_ids if frame_id in self.frames}
+    def _summary(self, resumed: Collection[str]) -> RunSummary:
+        frames = {frame_id: self.ends[frame_id] for frame_id in self.dataset.frame_ids}
         warnings = [*find_warnings(frames, sorted(self.dataset.classes)), *self.warnings]
-        if remade := self.record.remade:
-            found = f"files of {len(remade)} finished frames were damaged or gone and made again"
-            warnings.append(f"{found}: {_some(remade)}")
         if self.num_halved:
             warnings.append(
                 f"{self.num_halved} calls did not work with all of their frames and were halved: the last digits of "
                 "their results may differ from those of a run that has the memory"
             )
-        failed = {frame_id: reason for frame_id, reason in self.record.manifest.failed.items() if frame_id in frames}
+        failed = {frame_id: entry["reason"] for frame_id, entry in sorted(frames.items()) if "reason" in entry}
         return RunSummary(frames, tuple(resumed), failed, tuple(warnings), self.timings)
 
 
@@ -195,7 +202,7 @@ def run_manifest(dataset: StereoDataset, refiner: DirectShapeRefiner, batch_fram
     if refiner.extra_terms:
         settings["extra_terms"] = [_described(make) for make in refiner.extra_terms]
     hashes = SharedHashes(prior=hash_prior(refiner.prior), stereo_bias=hash_fields(dataset.disparity_fields))
-    return RunManifest(package_version(), settings, hashes)
+    return RunManifest(package_version(), settings, hashes, sorted(dataset.frame_ids))
 
 
 def _described(make: TermFactory) -> str:

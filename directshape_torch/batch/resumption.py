@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
 
 from directshape_torch.batch.run_summary import TIMINGS
 from directshape_torch.errors import DataFormatError, ResumeError
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import (
+    FrameEntry,
     done_entry,
     done_frames,
     failure_path,
     overlay_path,
-    read_failure,
     read_record,
     result_path,
     shapes_path,
@@ -28,7 +27,6 @@ from directshape_torch.io.run_folder import (
 from directshape_torch.io.run_manifest import (
     RESUME_CURE,
     UNKNOWN_CURE,
-    FrameEntry,
     RunManifest,
     check_mapping,
     check_resume,
@@ -38,7 +36,6 @@ from directshape_torch.io.run_manifest import (
 )
 from directshape_torch.io.stereo_dataset import StereoDataset
 
-_Found = TypeVar("_Found")
 # Hashing mostly waits for the disk or the network, so several threads read at a time.
 _READING_THREADS = 8
 _MESH = re.compile(r"(.+)_[0-9]{1,9}\.(ply|glb)")
@@ -48,86 +45,46 @@ OUTPUT_FOLDERS = ("data", "shapes", "meshes", "overlays", "tracks", "failed")
 _STALE_S = 3600.0
 
 
-class RunRecord:
-    """A `RunRecord` is the summary of a folder, which follows from the files of its frames.
+def check_folder_of(out_dir: Path, manifest: RunManifest, is_cleared: bool) -> None:
+    """Raise `ResumeError` if the folder has results of another configuration or prior, or of unknown origin."""
+    if (previous := read_manifest(summary_path(out_dir))) is not None:
+        check_resume(previous, manifest)
+        return
+    for folder in () if is_cleared else (out_dir / "data", out_dir / "shapes"):
+        if folder.is_dir() and any(folder.iterdir()):
+            raise ResumeError(
+                f"cannot resume: {folder} holds files, but {summary_path(out_dir)} is missing, so what they were made "
+                f"of is unknown; {UNKNOWN_CURE}"
+            )
+
+
+def join_summary(out_dir: Path, manifest: RunManifest) -> None:
+    """Write `summary.json` with the frames of this and of other runs into the folder.
 
     Raises:
-        ResumeError: the folder has results of another configuration or prior.
+        ResumeError: another run has begun in the folder, with other settings.
+    """
+    if (previous := read_manifest(summary_path(out_dir))) is not None:
+        check_resume(previous, manifest)
+        manifest = replace(manifest, frames=sorted({*previous.frames, *manifest.frames}))
+    write_manifest(summary_path(out_dir), manifest)
 
-    Attributes:
-        manifest: manifest that includes the frames of earlier runs.
-        remade: frames whose files were removed or damaged after they were finished; set by `finished_frames`.
+
+def finished_frames(
+    out_dir: Path, dataset: StereoDataset, run: str, outputs: Sequence[str]
+) -> tuple[dict[str, FrameEntry], list[str]]:
+    """The entries of frames that need no work, and frames that were finished and have lost files, which are removed.
+
+    The files of finished frames are complete, unchanged and made by the run with the hash `run`.
+
+    Raises:
+        ResumeError: the input files of a finished frame have changed or are missing.
     """
 
-    def __init__(self, out_dir: Path, manifest: RunManifest, outputs: Sequence[str], is_cleared: bool = False) -> None:
-        self.out_dir, self.outputs, self.manifest = out_dir, outputs, manifest
-        self.remade: list[str] = []
-        if not self._takes_in_summary() and not is_cleared:
-            self._check_empty()
-
-    def finished_frames(self, dataset: StereoDataset) -> list[str]:
-        """Frames of the data set that need no work, because all outputs are complete and belong to the current inputs.
-
-        Raises:
-            ResumeError: the input files of a finished frame have changed or are missing.
-        """
-        frames, done = self.manifest.frames, set(done_frames(self.out_dir))
-        known = [f for f in dataset.frame_ids if f in done or (f in frames and frames[f]["state"] == "done")]
-        checked = _in_threads(partial(self._checked, dataset), known)
-        found = {frame_id: entry for frame_id, (entry, _) in checked.items() if entry is not None}
-        self.remade = [frame_id for frame_id, (_, is_damaged) in checked.items() if is_damaged]
-        for frame_id in self.remade:
-            with suppress(OSError):
-                result_path(self.out_dir, frame_id).unlink()
-        frames.update(found)
-        return list(found)
-
-    def begin(self, frame_ids: Sequence[str]) -> None:
-        """Write the summary with frames that wait, and remove the reasons why they have failed before."""
-        self.manifest.frames.update({frame_id: {"state": "waiting"} for frame_id in frame_ids})
-        waiting = set(frame_ids)
-        for path in (self.out_dir / "failed").glob("*.txt"):
-            if path.stem in waiting:
-                path.unlink()
-        self.write()
-
-    def gather(self) -> None:
-        """Add what the files in the folder say, also those of other runs into it.
-
-        Raises:
-            ResumeError: another run has begun in the folder, with other settings.
-        """
-        self._takes_in_summary()
-        frames = self.manifest.frames
-        is_done = {name for name, entry in frames.items() if entry["state"] == "done"}
-        unknown = [frame_id for frame_id in done_frames(self.out_dir) if frame_id not in is_done]
-        entries = _in_threads(self._entry, unknown)
-        frames.update({frame_id: entry for frame_id, entry in entries.items() if entry is not None})
-        for name, entry in frames.items():
-            if entry["state"] == "waiting" and failure_path(self.out_dir, name).is_file():
-                frames[name] = {"state": "failed", "reason": read_failure(self.out_dir, name)}
-
-    def write(self) -> None:
-        """Write `summary.json`."""
-        write_manifest(summary_path(self.out_dir), self.manifest)
-
-    def _takes_in_summary(self) -> bool:
-        """Take in the frames of the summary in the folder, and say whether there is one."""
-        previous = read_manifest(summary_path(self.out_dir))
-        if previous is None:
-            return False
-        check_resume(previous, self.manifest)
-        for frame_id, entry in previous.frames.items():
-            self.manifest.frames.setdefault(frame_id, entry)
-        return True
-
-    def _entry(self, frame_id: str) -> FrameEntry | None:
-        return done_entry(self.out_dir, frame_id, self.manifest.hash, self.outputs)
-
-    def _checked(self, dataset: StereoDataset, frame_id: str) -> tuple[FrameEntry | None, bool]:
+    def checked(frame_id: str) -> tuple[FrameEntry | None, bool]:
         """The entry of a finished frame, or None, and whether an unfinished frame has lost files."""
         try:
-            path = shapes_path(self.out_dir, frame_id)
+            path = shapes_path(out_dir, frame_id)
             record = read_record(path, read_shapes(path))
         except DataFormatError:
             return None, True
@@ -138,22 +95,26 @@ class RunRecord:
                 f"cannot resume: frame {frame_id} was refined from a file that is gone: {error}; {RESUME_CURE}"
             ) from error
         check_mapping(f"frame {frame_id}: sha256 of", record.inputs, hashes)
-        entry = self._entry(frame_id)
-        return entry, entry is None and set(self.outputs) <= set(record.outputs)
+        entry = done_entry(out_dir, frame_id, run, outputs)
+        return entry, entry is None and set(outputs) <= set(record.outputs)
 
-    def _check_empty(self) -> None:
-        for name in ("data", "shapes"):
-            folder = self.out_dir / name
-            if folder.is_dir() and any(folder.iterdir()):
-                raise ResumeError(
-                    f"cannot resume: {folder} holds files, but {summary_path(self.out_dir)} is missing, so what they "
-                    f"were made of is unknown; {UNKNOWN_CURE}"
-                )
-
-
-def _in_threads(read: Callable[[str], _Found], frame_ids: Sequence[str]) -> dict[str, _Found]:
+    written = {path.stem for path in (out_dir / "shapes").glob("*.npz")}
+    known = [frame_id for frame_id in dataset.frame_ids if frame_id in written]
     with ThreadPoolExecutor(_READING_THREADS) as threads:
-        return dict(zip(frame_ids, threads.map(read, frame_ids), strict=True))
+        ends = dict(zip(known, threads.map(checked, known), strict=True))
+    damaged = [frame_id for frame_id, (_, is_damaged) in ends.items() if is_damaged]
+    for frame_id in damaged:
+        with suppress(OSError):
+            result_path(out_dir, frame_id).unlink()
+    return {frame_id: entry for frame_id, (entry, _) in ends.items() if entry is not None}, damaged
+
+
+def forget_failures(out_dir: Path, frame_ids: Iterable[str]) -> None:
+    """Remove the reasons why frames have failed before."""
+    wanted = set(frame_ids)
+    for path in (out_dir / "failed").glob("*.txt"):
+        if path.stem in wanted:
+            path.unlink()
 
 
 def remove_stale_files(out_dir: Path) -> None:

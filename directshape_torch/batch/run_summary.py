@@ -18,6 +18,7 @@ import torch
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_json
 from directshape_torch.files.read_files import read_json
+from directshape_torch.io.run_folder import FrameEntry
 from directshape_torch.status import Status, counted
 
 TIMINGS = "timings.json"
@@ -181,7 +182,7 @@ def _rounded(number: float | None) -> float | None:
 class RunSummary:
     """A `RunSummary` is the outcome of `refine_dataset`."""
 
-    frames: Mapping[str, Mapping[str, Any]]  # the entry in `summary.json` of each frame of the data set
+    frames: Mapping[str, FrameEntry]  # how each frame of the data set ended
     resumed: tuple[str, ...]  # frames that an earlier run had finished
     failed: Mapping[str, str]  # frames that could not be refined, with the reason
     warnings: tuple[str, ...]  # likely mistakes that did not cause a failure
@@ -190,7 +191,7 @@ class RunSummary:
     @property
     def num_cars(self) -> int:
         """Number of cars of all frames that did not fail, refined or not."""
-        return sum(entry.get("cars", 0) for entry in self.frames.values() if entry["state"] == "done")
+        return sum(entry.get("cars", 0) for entry in self.frames.values())
 
     @property
     def statuses(self) -> dict[str, int]:
@@ -203,23 +204,23 @@ class RunSummary:
         return int(bool(self.failed))
 
 
-def count_statuses(frames: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
-    """Number of cars of each status that occurs in the entries of `summary.json`."""
+def count_statuses(frames: Mapping[str, FrameEntry]) -> dict[str, int]:
+    """Number of cars of each status that occurs in the entries of frames."""
     counts: Counter[str] = Counter()
     for entry in frames.values():
         counts.update(entry.get("statuses", {}))
     return {status.name: counts[status.name] for status in Status if counts[status.name]}
 
 
-def find_warnings(frames: Mapping[str, Mapping[str, Any]], classes: Sequence[str]) -> tuple[str, ...]:
+def find_warnings(frames: Mapping[str, FrameEntry], classes: Sequence[str]) -> tuple[str, ...]:
     """Warnings about results that suggest wrong inputs of a run.
 
     Examples:
-        >>> find_warnings({"000001": {"state": "done", "lines": 2, "cars": 0, "statuses": {}}}, ["Car"])
+        >>> find_warnings({"000001": {"lines": 2, "cars": 0, "statuses": {}}}, ["Car"])
         ('none of the 2 input lines is of class Car with a 3D box: nothing was refined',)
     """
-    done = [entry for entry in frames.values() if entry["state"] == "done"]
-    num_lines, num_cars = (sum(entry.get(name, 0) for entry in done) for name in ("lines", "cars"))
+    done = [entry for entry in frames.values() if "reason" not in entry]
+    num_lines, num_cars = sum(entry["lines"] for entry in done), sum(entry["cars"] for entry in done)
     statuses = count_statuses(frames)
     refined = sum(count for name, count in statuses.items() if Status[name].is_refined)
     no_mask, no_camera = statuses.get("no_mask", 0), statuses.get("behind_camera", 0)
@@ -243,14 +244,14 @@ def find_warnings(frames: Mapping[str, Mapping[str, Any]], classes: Sequence[str
     return tuple(found)
 
 
-def _reasons(frames: Mapping[str, Mapping[str, Any]]) -> str:
+def _reasons(frames: Mapping[str, FrameEntry]) -> str:
     """Why the first cars have no mask."""
     every = [
         f"line {line} of {frame_id}: {reason}"
         for frame_id, entry in frames.items()
         for line, reason in entry.get("no_mask", {}).items()
     ]
-    more = f"; {len(every) - _NAMED} more in summary.json" if len(every) > _NAMED else ""
+    more = f"; {len(every) - _NAMED} more" if len(every) > _NAMED else ""
     return "; ".join(every[:_NAMED]) + more
 
 

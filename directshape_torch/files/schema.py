@@ -24,13 +24,14 @@ def record_of(path: Path | str, cls: type[_RecordT], content: Any, cure: str = "
         where: place in the file, before the name of a field, such as "objects[0].".
 
     Examples:
-        >>> from directshape_torch.io.run_log import RunEvent
-        >>> record_of("a.json", RunEvent, {"frame": "000107", "at": 0.5}).frame
+        >>> from dataclasses import make_dataclass
+        >>> Event = make_dataclass("Event", [("frame", str), ("at", float)])
+        >>> record_of("a.json", Event, {"frame": "000107", "at": 0.5}).frame
         '000107'
-        >>> record_of("a.json", RunEvent, {"frame": 107, "at": 0.5})
+        >>> record_of("a.json", Event, {"frame": 107, "at": 0.5})
         Traceback (most recent call last):
         ...
-        directshape_torch.errors.DataFormatError: a.json: frame: expected str or nothing, got 107
+        directshape_torch.errors.DataFormatError: a.json: frame: expected str, got 107
     """
     if not isinstance(content, dict):
         raise DataFormatError(path, f"{where.rstrip('.')} expected an object, got {shown(content)}".strip(), cure=cure)

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -26,11 +26,11 @@ from directshape_torch.io.config_files import config_from_mapping
 from directshape_torch.io.frame_choice import frames_among
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.result_files import ShapeArrays, read_shapes
-from directshape_torch.io.run_manifest import FrameEntry, hash_bytes, read_manifest
+from directshape_torch.io.run_manifest import hash_bytes, read_manifest
 from directshape_torch.status import Status
 
 _AGAIN = "refine the frame again"
-# The summary names cars whose probability to be not worse is below `_SURE`, at most `_MOST_DOUBTFUL` of a frame.
+# An entry names cars whose probability to be not worse is below `_SURE`, at most `_MOST_DOUBTFUL` of a frame.
 _SURE, _MOST_DOUBTFUL = 0.95, 3
 # File names in a record must stay within the folder, since anybody may have written them.
 _FILE = re.compile(r"(data|shapes|meshes|overlays)/[^/\\]+")
@@ -64,6 +64,24 @@ def failure_path(out_dir: Path | str, frame_id: str) -> Path:
 def mesh_path(out_dir: Path | str, frame_id: str, line_number: int, mesh_format: str) -> Path:
     """The mesh file of one car; lines are counted from 1."""
     return Path(out_dir) / "meshes" / f"{frame_id}_{line_number}.{mesh_format}"
+
+
+class FrameEntry(TypedDict, total=False):
+    """A `FrameEntry` says how a frame ended: a failed frame has only `reason`, a frame that is done has the rest."""
+
+    reason: str
+    lines: int
+    cars: int
+    masks_left: int
+    masks_right: int
+    ground_source: str
+    statuses: dict[str, int]  # numbers of cars
+    no_mask: dict[str, str]  # reasons, by line
+    # Expected numbers of refined cars, and the probability to be not worse and the standard deviations from the box of
+    # cars that are most probably worse, by line.
+    better: float
+    worse: float
+    doubtful: dict[str, list[float]]
 
 
 @dataclass(frozen=True)
@@ -122,7 +140,7 @@ def read_done(
 
 
 def done_entry(out_dir: Path, frame_id: str, run: str, outputs: Iterable[str]) -> FrameEntry | None:
-    """The entry of `summary.json` for a frame for which `read_done` raises no error, else None."""
+    """The entry of a frame for which `read_done` raises no error, else None."""
     with suppress(DataFormatError):
         return frame_entry(*read_done(out_dir, frame_id, run, outputs))
     return None
@@ -134,11 +152,10 @@ def read_failure(out_dir: Path, frame_id: str) -> str:
 
 
 def frame_entry(shapes: ShapeArrays, record: FrameRecord) -> FrameEntry:
-    """The entry of `summary.json` for a frame that is done."""
+    """The entry of a frame that is done."""
     cars = zip(shapes.input_lines.tolist(), shapes.statuses, shapes.messages, strict=True)
     better, worse, doubtful = _expected(shapes)
     return {
-        "state": "done",
         "lines": record.lines,
         "cars": len(shapes.input_lines),
         "masks_left": int(shapes.has_mask_left.sum()),

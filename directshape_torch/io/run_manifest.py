@@ -1,6 +1,6 @@
-"""This module reads and writes `summary.json` of a run (schema 2), so that a run can resume.
+"""This module reads and writes `summary.json` of a run (schema 3), so that a run can resume.
 
-The file says how the results were made and how each frame ended. Its content does not depend on time, machine or paths.
+The file says how the results were made, and of which frames. Its content does not depend on time, machine or paths.
 """
 
 from __future__ import annotations
@@ -8,9 +8,9 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypedDict
+from typing import Any, TypedDict
 
 import torch
 from torch import Tensor
@@ -23,7 +23,7 @@ from directshape_torch.files.schema import check_type, record_of
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.shape.shape_prior import ShapePrior
 
-MANIFEST_SCHEMA_VERSION = 2
+MANIFEST_SCHEMA_VERSION = 3
 RESUME_CURE = "choose another output folder, or start again with --fresh, which removes the results in this one"
 # Without a valid summary it is unknown which files are results, so --fresh removes none.
 UNKNOWN_CURE = "choose another output folder, or remove this one"
@@ -43,47 +43,20 @@ class SharedHashes(TypedDict):
     stereo_bias: str | None
 
 
-class _FrameState(TypedDict):
-    # This key has a class of its own, because `Required` in a string annotation is ignored at run time.
-    state: Literal["waiting", "done", "failed"]
-
-
-class FrameEntry(_FrameState, total=False):
-    """A `FrameEntry` describes one frame in `frames`; a failed frame has `reason`, a frame that is done the rest."""
-
-    reason: str
-    lines: int
-    cars: int
-    masks_left: int
-    masks_right: int
-    ground_source: str
-    statuses: dict[str, int]
-    no_mask: dict[str, str]
-    better: float
-    worse: float
-    doubtful: dict[str, list[float]]
-
-
 @dataclass(frozen=True)
 class RunManifest:
-    """A `RunManifest` says how the results of a run were made and how each frame ended."""
+    """A `RunManifest` says how the results of a folder are made, and of which frames."""
 
     package_version: str  # of this package
     config: Mapping[str, Any]  # every setting that affects the results, nested as in the configuration file
     sha256: SharedHashes  # hashes of the files that all frames use
-    frames: dict[str, FrameEntry] = field(default_factory=dict)  # how each frame ended
+    frames: Sequence[str] = ()  # of all runs into the folder, in order
 
     @property
     def hash(self) -> str:
         """Hash of all fields except the frames; the files of a frame contain it."""
         made_of = [self.package_version, self.config, self.sha256]
         return hash_bytes(json.dumps(made_of, sort_keys=True, default=list).encode())
-
-    @property
-    def failed(self) -> dict[str, str]:
-        """The reason of each frame that could not be refined."""
-        frames = sorted(self.frames.items())
-        return {name: entry.get("reason", "unknown") for name, entry in frames if entry["state"] == "failed"}
 
 
 def hash_bytes(content: bytes) -> str:

@@ -37,24 +37,24 @@ class RunStatus:
 def read_status(out_dir: Path | str, now: float | None = None) -> RunStatus:
     """The status of the runs into a folder at a time (seconds since 1970), by default now.
 
-    The summary is written when a run begins, and names the frames that wait; those with a later file are done.
+    The summary is written when a run begins, so frames with a later file are of this run. A frame that gets further
+    outputs counts as done all the while.
     """
     out_dir, path = Path(out_dir), summary_path(out_dir)
     manifest = read_manifest(path)
     if manifest is None:
         raise DataFormatError(path, "is missing, so no run of 'directshape refine' is or was here")
-    began_at, frames = path.stat().st_mtime, manifest.frames
+    began_at, frames = path.stat().st_mtime, set(manifest.frames)
     ended_at = {name: shapes_path(out_dir, name).stat().st_mtime for name in done_frames(out_dir) if name in frames}
-    earlier = [name for name in ended_at if frames[name]["state"] == "done"]
-    recent = {name: at for name, at in ended_at.items() if frames[name]["state"] != "done" and at >= began_at}
-    failures = [name for name in frames if name not in ended_at and failure_path(out_dir, name).is_file()]
+    recent = sorted(at for at in ended_at.values() if at >= began_at)
+    failures = [name for name in sorted(frames.difference(ended_at)) if failure_path(out_dir, name).is_file()]
     failed = {name: read_failure(out_dir, name) for name in failures}
-    num_left = len(frames) - len(earlier) - len(recent) - len(failed)
-    rate = _rate(began_at, sorted(recent.values()), time.time() if now is None else now) if num_left else None
+    num_left = len(frames) - len(ended_at) - len(failed)
+    rate = _rate(began_at, recent, time.time() if now is None else now) if num_left else None
     return RunStatus(
         num_frames=len(frames),
-        num_done=len(earlier) + len(recent),
-        num_earlier=len(earlier),
+        num_done=len(ended_at),
+        num_earlier=len(ended_at) - len(recent),
         failed=failed,
         frames_per_s=rate,
         seconds_left=num_left / rate if rate else None,

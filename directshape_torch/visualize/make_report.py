@@ -13,7 +13,7 @@ from typing import Any
 from directshape_torch.errors import InputError
 from directshape_torch.files.atomic_files import replaced_file
 from directshape_torch.io.image_files import read_rgb
-from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.io.run_folder import FrameEntry, RunFolder, frame_entry
 from directshape_torch.io.run_manifest import flatten, hash_fields
 from directshape_torch.io.run_status import read_status
 from directshape_torch.refinement.trust import WORSE_BY
@@ -60,10 +60,10 @@ def make_report(
         raise InputError("most_frames", "0 or more", str(most_frames))
     run, mean, config = inputs.run, inputs.mean, inputs.run.refiner_config()
     rows: list[CarRow] = []
-    grounds: Counter[str] = Counter()
+    entries: dict[str, FrameEntry] = {}
     for number, frame_id in enumerate(run.frame_ids):
         frame = RunFrame(inputs, frame_id)
-        grounds[frame.result.shapes.ground_source] += 1
+        entries[frame_id] = frame_entry(frame.result.shapes, frame.result.record)
         rows += car_rows(number, frame.result, frame.detections, frame.labels)
     detailed = choose_frames(rows, len(run.frame_ids), most_frames)
     head, foot = page_frame(f"{run.path.resolve().name}: refined cars")
@@ -80,7 +80,7 @@ def make_report(
         file.write(
             data_block("cars", {"columns": list(rows[0]) if rows else [], "rows": [list(row.values()) for row in rows]})
         )
-        file.write(data_block("run", _run_facts(run, rows, grounds, notes)))
+        file.write(data_block("run", _run_facts(run, rows, entries, notes)))
         file.write(foot)
     return ReportOutcome(page, page.stat().st_size, len(run.frame_ids), len(detailed), len(rows), tuple(notes))
 
@@ -113,20 +113,19 @@ def _unfinished(out_dir: Path) -> list[str]:
 
 
 def _run_facts(
-    run: RunFolder, rows: Sequence[CarRow], grounds: Mapping[str, int], notes: Sequence[str]
+    run: RunFolder, rows: Sequence[CarRow], entries: Mapping[str, FrameEntry], notes: Sequence[str]
 ) -> dict[str, Any]:
     """The top of the page as JSON: counts, settings, mean errors, and notes about the page."""
     manifest = run.manifest
-    entries = {name: entry for name, entry in manifest.frames.items() if name in run.frame_ids}
     return {
         "name": run.path.resolve().name,
         "package_version": manifest.package_version,
         "frames_done": len(run.frame_ids),
-        "failed": {name: why for name, why in manifest.failed.items() if name not in run.frame_ids},
+        "failed": dict(read_status(run.path).failed),
         "cars": len(rows),
         "refined": sum(row["refined"] for row in rows),
         "statuses": _statuses(rows),
-        "ground_sources": dict(grounds),
+        "ground_sources": dict(Counter(entry["ground_source"] for entry in entries.values())),
         "sha256": dict(manifest.sha256),
         "settings": {name: str(value) for name, value in sorted(flatten(manifest.config).items())},
         "errors": _mean_errors(rows),

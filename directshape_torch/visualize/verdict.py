@@ -15,14 +15,14 @@ _LARGE_M = 0.4
 
 
 def verdict(frames: Mapping[str, Mapping[str, Any]], rigs: Sequence[RigEstimate]) -> list[str]:
-    """Sentences about the entries of `summary.json` and about the rigs that the run has estimated.
+    """Sentences about the entries of frames and about the rigs that the run has estimated.
 
     Examples:
-        >>> entry = {"state": "done", "cars": 2, "statuses": {"converged": 2}, "better": 1.6, "worse": 0.2}
+        >>> entry = {"cars": 2, "statuses": {"converged": 2}, "better": 1.6, "worse": 0.2}
         >>> verdict({"000001": {**entry, "doubtful": {"7": [0.81, 3.9]}}}, [])[0]
         '2 of 2 boxes are refined: about 1.6 of them better than before, 0.2 worse by more than 0.05 of BEV IoU'
     """
-    done = {name: entry for name, entry in frames.items() if entry["state"] == "done"}
+    done = {name: entry for name, entry in frames.items() if "reason" not in entry}
     num_cars = sum(entry["cars"] for entry in done.values())
     if not num_cars:
         return []

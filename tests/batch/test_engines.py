@@ -21,11 +21,10 @@ from directshape_torch.batch.frame_groups import FrameGroup, frame_groups
 from directshape_torch.batch.group_refinement import GroupReport
 from directshape_torch.batch.options import RunObserver
 from directshape_torch.errors import DirectShapeError
-from directshape_torch.io.run_folder import read_failure
-from directshape_torch.io.run_manifest import FrameEntry
+from directshape_torch.io.run_folder import FrameEntry, read_failure
 from directshape_torch.io.run_status import read_status
 
-DONE: FrameEntry = {"state": "done"}
+DONE: FrameEntry = {"cars": 1}
 
 
 class Imagined:
@@ -59,7 +58,7 @@ def test_the_frame_that_kills_is_found_among_its_companions(tmp_path: Path) -> N
     reason = "its worker died each of 2 times (killed, out of memory or crashed)"
     assert ends(workers, tmp_path, size=4) == {
         **dict.fromkeys("abdefgh", DONE),
-        "c": {"state": "failed", "reason": reason},
+        "c": {"reason": reason},
     }
     assert workers.calls == [tuple("abcd"), tuple("efgh"), tuple("ab"), tuple("cd"), ("c",), ("d",)]
     assert read_failure(tmp_path, "c") == reason

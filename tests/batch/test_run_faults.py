@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
@@ -248,16 +247,6 @@ def test_failures_are_noted_and_forgotten(root: Path, tmp_path: Path, undisturbe
     (root / "masks" / "000003.json").write_bytes(whole)
     assert refine(root, tmp_path).failed == {}
     assert result_files(tmp_path) == result_files(undisturbed)
-
-
-def test_frames_without_an_entry_in_the_summary_are_finished(root: Path, tmp_path: Path, undisturbed: Path) -> None:
-    """Of a run that was killed before it wrote the summary, and one that asks for other frames."""
-    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
-    summary = json.loads((out / "summary.json").read_text())
-    (out / "summary.json").write_text(json.dumps({**summary, "frames": {}}))
-    one = quick_runs.dataset(root, frames=FRAMES[:1])
-    assert refine_dataset(one, QuickRefiner(root), out, RefineOptions(threads=1)).resumed == FRAMES[:1]
-    assert result_files(out) == result_files(undisturbed)
 
 
 @pytest.mark.parametrize("name", ["data/000002.txt", "shapes/000002.npz"])

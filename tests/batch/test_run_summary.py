@@ -24,10 +24,10 @@ from directshape_torch.batch.run_summary import (
 def done(**statuses: int) -> dict[str, Any]:
     cars = sum(statuses.values())
     masks = {"masks_left": cars, "masks_right": cars}
-    return {"state": "done", "lines": cars + 1, "cars": cars, "statuses": statuses, "ground_source": "file", **masks}
+    return {"lines": cars + 1, "cars": cars, "statuses": statuses, "ground_source": "file", **masks}
 
 
-FAILED = {"state": "failed", "reason": "cut short"}
+FAILED = {"reason": "cut short"}
 
 
 def timings() -> RunTimings:

@@ -60,14 +60,10 @@ def test_summary(out: Path) -> None:
     text = section("`summary.json`")
     assert f"schema {MANIFEST_SCHEMA_VERSION}" in text
     summary = json.loads((out / "summary.json").read_text())
-    for part in (
-        summary,
-        summary["config"],
-        summary["sha256"],
-        *summary["frames"].values(),
-    ):
+    assert summary["frames"] == ["000000", "000001"]
+    for part in (summary, summary["config"], summary["sha256"]):
         for name in part:
-            assert f'"{name}"' in text or re.fullmatch(r"\d{6}", name), name
+            assert f'"{name}"' in text, name
 
 
 def test_timings(out: Path) -> None:

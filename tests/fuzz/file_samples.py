@@ -205,6 +205,6 @@ def _runs(root: Path, out: Path) -> dict[str, Sample]:
         "results": Sample(out / "summary.json", lambda: RunFolder(out)),
         "report": Sample(out / "summary.json", report),
         "status": Sample(out / "summary.json", lambda: format_status(read_status(out))),
-        "times": Sample(out / "timings.json", lambda: digit_warnings(out, RunTimings()), is_exact=False),
+        "timings": Sample(out / "timings.json", lambda: digit_warnings(out, RunTimings()), is_exact=False),
         "results of a frame": Sample(out / "shapes" / f"{FRAME}.npz", lambda: RunFolder(out).read(FRAME)),
     }

@@ -17,7 +17,7 @@ FORMATS = (
     "tracking", "shapes", "disparity", "field", "rigs", "split", "points",
     "scan", "network", "prior", "boxes", "times", "poses", "mesh obj", "mesh ply", "mesh glb", "mesh off", "mesh stl",
     "settings", "coco", "instances", "image", "calibration", "plane", "labels", "detections", "masks", "rig",
-    "frame", "raw calibration", "sequence calibration", "summary", "results", "report", "run",
+    "frame", "raw calibration", "sequence calibration", "summary", "results", "report", "status", "timings",
     "results of a frame",
 )  # fmt: skip
 # More of them, and what they cost: scripts/fuzz.py.

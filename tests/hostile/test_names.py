@@ -38,7 +38,7 @@ def test_records_that_climb(shared_kitti: Path, tmp_path: Path) -> None:
     refine(shared_kitti, out)
     foreign.write_text("mine")
     content = json.loads((out / "summary.json").read_text())
-    content["frames"]["../../foreign"] = content["frames"]["000000"]
+    content["frames"].append("../../foreign")
     (out / "summary.json").write_text(json.dumps(content))
     with pytest.raises(DataFormatError, match=r"summary\.json: .*frames.*foreign"):
         refine(shared_kitti, out)

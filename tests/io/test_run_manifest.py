@@ -31,7 +31,7 @@ def manifest() -> RunManifest:
         package_version="0.1.0",
         config={"solver": {"iterations": 20, "damping": 0.01}, "classes": ("Car",)},
         sha256={"prior": A, "stereo_bias": None},
-        frames={"000001": {"state": "done", "cars": 3}, "000002": {"state": "failed", "reason": "cut short"}},
+        frames=["000001", "000002"],
     )
 
 
@@ -41,7 +41,7 @@ def test_round_trip_resumes(tmp_path: Path) -> None:
     write_manifest(path, manifest())
     previous = read_manifest(path)
     check_resume(previous, manifest())
-    assert previous.failed == {"000002": "cut short"}
+    assert previous.frames == ["000001", "000002"]
     assert previous.hash == manifest().hash != dataclasses.replace(manifest(), package_version="0.2.0").hash
 
 
@@ -71,10 +71,10 @@ def test_differences_are_named(changes: dict[str, object], message: str) -> None
 def test_schema_and_damage(tmp_path: Path) -> None:
     path = tmp_path / "summary.json"
     write_manifest(path, manifest())
-    path.write_text(path.read_text().replace('"schema_version": 2', '"schema_version": 9'))
-    with pytest.raises(ResumeError, match="schema version is 9, this program writes 2"):
+    path.write_text(path.read_text().replace('"schema_version": 3', '"schema_version": 9'))
+    with pytest.raises(ResumeError, match="schema version is 9, this program writes 3"):
         read_manifest(path)
-    for content in ("{", "[]", "{}", '{"schema_version": 2, "x": 2}'):
+    for content in ("{", "[]", "{}", '{"schema_version": 3, "x": 2}'):
         path.write_text(content)
         with pytest.raises(DataFormatError, match=r"summary\.json: .*(no summary|valid JSON|'x' is unknown)"):
             read_manifest(path)

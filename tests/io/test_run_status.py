@@ -13,7 +13,7 @@ from directshape_torch.cli.main import main
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_text
 from directshape_torch.io.run_folder import failure_path, result_path, shapes_path, summary_path
-from directshape_torch.io.run_manifest import FrameEntry, RunManifest, write_manifest
+from directshape_torch.io.run_manifest import RunManifest, write_manifest
 from directshape_torch.io.run_status import format_status, read_status
 
 TODO = tuple(f"{number:06d}" for number in range(10, 20))
@@ -23,9 +23,7 @@ LATER = "000002"
 
 def begun(out: Path, times: Mapping[str, float], failed: Mapping[str, str] | None = None) -> None:
     """A run of twelve frames, two of them from an earlier run, that refines since second 1000."""
-    states: dict[str, FrameEntry] = {name: {"state": "done"} for name in EARLIER}
-    states |= {name: {"state": "waiting"} for name in TODO}
-    write_manifest(summary_path(out), RunManifest("0", {}, {"prior": "a", "stereo_bias": None}, states))
+    write_manifest(summary_path(out), RunManifest("0", {}, {"prior": "a", "stereo_bias": None}, [*EARLIER, *TODO]))
     os.utime(summary_path(out), (1000.0, 1000.0))
     for name, at in {**dict.fromkeys(EARLIER, 900.0), **times}.items():
         for path in (result_path(out, name), shapes_path(out, name)):
@@ -60,9 +58,8 @@ def test_a_run_that_is_stuck_becomes_slower(tmp_path: Path) -> None:
 
 
 def test_what_counts_as_done(tmp_path: Path) -> None:
-    # The second frame waits although it has files of an earlier run, as one that gets further outputs; the third is no
-    # frame of the data set, and the fourth has only one of its files.
-    begun(tmp_path, {TODO[0]: 1001.0, TODO[1]: 990.0, LATER: 1001.0, TODO[3]: 1001.0}, {TODO[0]: "of another run"})
+    # The second is no frame of the data set, and the third has only one of its files.
+    begun(tmp_path, {TODO[0]: 1001.0, LATER: 1001.0, TODO[3]: 1001.0}, {TODO[0]: "of another run"})
     result_path(tmp_path, TODO[3]).unlink()
     status = read_status(tmp_path, 1002.0)
     assert (status.num_done, status.num_earlier, status.failed, status.num_left) == (3, 2, {}, 9)

@@ -184,7 +184,7 @@ def test_a_run_that_was_cut_off(finished: FinishedRun, tmp_path: Path) -> None:
     (out / "data" / "000001.txt").write_bytes(text)
     # The run has a third frame to do.
     summary = json.loads((out / "summary.json").read_text())
-    summary["frames"]["000002"] = {"state": "waiting"}
+    summary["frames"].append("000002")
     (out / "summary.json").write_text(json.dumps(summary))
     outcome = make_report(finished.inputs(RunFolder(out)), tmp_path / "b.html")
     assert blocks(outcome.path)["frames"]["ids"] == ["000000", "000001"]

@@ -16,7 +16,7 @@ from directshape_torch.visualize.verdict import verdict
 def frames(**changes: Any) -> dict[str, Any]:
     record = FrameRecord("run", {}, [], {}, 3, 3)
     entry = dict(frame_entry(shape_arrays(3, **changes), record))
-    return {"000001": entry, "000002": entry, "000003": {"state": "failed", "reason": "no image"}}
+    return {"000001": entry, "000002": entry, "000003": {"reason": "no image"}}
 
 
 def test_expected_numbers_are_those_of_refined_cars_alone() -> None:
@@ -25,7 +25,7 @@ def test_expected_numbers_are_those_of_refined_cars_alone() -> None:
         "4 of 6 boxes are refined: about 3.6 of them better than before, 0.1 worse by more than 0.05 of BEV IoU"
     )
     assert others == []
-    assert verdict({"000003": {"state": "failed", "reason": "no image"}}, []) == []
+    assert verdict({"000003": {"reason": "no image"}}, []) == []
 
 
 def test_the_most_doubtful_cars_are_named_first() -> None:
