@@ -66,14 +66,17 @@ def refine_group(job: RunJob, group: FrameGroup) -> GroupReport:
     Raises:
         DirectShapeError: no other frame could be refined either.
     """
-    found = {frame_id: done_entry(job.out_dir, frame_id, job.run, job.options.outputs) for frame_id in group.wanted}
-    ends = {frame_id: entry for frame_id, entry in sorted(found.items()) if entry is not None}
-    step, cpu_start_s = _GroupStep(job, group.without(ends), ends), time.process_time()
+    cpu_start_s = time.process_time()
+    found = {name: done_entry(job.out_dir, name, job.run, job.options.outputs) for name in sorted(group.wanted)}
+    ends = {name: entry for name, entry in found.items() if entry is not None}
+    step = _GroupStep(job, group.without(ends))
     try:
         step.refine(group.frame_ids)
     except STOPS_THE_RUN as error:
         # Other processes may not be able to read errors of other classes.
         raise DirectShapeError(_reason(error)) from error
+    # Frames that were finished before stay in the call, for the sake of the bytes of the others.
+    step.report.ends |= ends
     timings = step.report.timings
     timings.cpu_s = time.process_time() - cpu_start_s
     timings.peak_mb, timings.peak_device_mb = peak_memory_mb(), peak_device_memory_mb(timings.device)
@@ -83,9 +86,9 @@ def refine_group(job: RunJob, group: FrameGroup) -> GroupReport:
 class _GroupStep:
     """A `_GroupStep` is the refinement of one group."""
 
-    def __init__(self, job: RunJob, group: FrameGroup, ends: dict[str, FrameEntry]) -> None:
+    def __init__(self, job: RunJob, group: FrameGroup) -> None:
         self.job, self.group = job, group
-        self.report = GroupReport(ends, RunTimings(job.refiner.prior.origin.device))
+        self.report = GroupReport({}, RunTimings(job.refiner.prior.origin.device))
 
     def refine(self, frame_ids: Sequence[str]) -> None:
         """Refine frames together, or in halves after a failure, down to the single frame that is the cause."""

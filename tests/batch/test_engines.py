@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
+import signal
 import sys
 from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from helpers import quick_runs
 from helpers.faulty_refiners import DeadlyRefiner, HungryRefiner, QuickRefiner
 from helpers.kitti_folder import write_data_set
 from helpers.output_folders import result_files
+from numpy.typing import NDArray
 
 from directshape_torch.batch.engines import reports_of
 from directshape_torch.batch.frame_groups import FrameGroup, frame_groups
@@ -23,6 +28,7 @@ from directshape_torch.batch.options import RunObserver
 from directshape_torch.errors import DirectShapeError
 from directshape_torch.io.run_folder import FrameEntry, read_failure
 from directshape_torch.io.run_status import read_status
+from directshape_torch.io.stereo_dataset import LoadedFrame
 
 DONE: FrameEntry = {"cars": 1}
 
@@ -103,6 +109,38 @@ def test_two_workers_of_which_one_is_killed_write_the_bytes_of_one_process(root:
     assert sorted(call.frame_ids for call in summary.timings.calls) == [FRAMES[:2], FRAMES[2:4], FRAMES[4:]]
     assert (summary.timings.workers, summary.timings.threads) == (2, 1)
     assert read_status(tmp_path / "two").num_done == len(FRAMES)
+
+
+def blank(*_: object) -> NDArray[np.uint8]:
+    return np.zeros((2, 2), np.uint8)
+
+
+@dataclass
+class DeadlyPicture:
+    """A `DeadlyPicture` kills its process at the picture of a frame, the first time."""
+
+    frame_id: str
+    note: Path
+
+    def __call__(self, loaded: LoadedFrame, _: object) -> NDArray[np.uint8]:
+        if loaded.frame_id == self.frame_id and not self.note.exists():
+            self.note.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return blank()
+
+
+def test_what_was_finished_before_the_death_stays_in_the_call_and_is_not_written_again(
+    root: Path, tmp_path: Path
+) -> None:
+    deadly = DeadlyPicture(FRAMES[2], tmp_path / "note")
+    summary = refine(root, tmp_path / "two", QuickRefiner(root), draw=deadly, batch_frames=3, workers=1)
+    died_at = (tmp_path / "note").stat().st_mtime
+    written = [path.stem for path in (tmp_path / "two" / "shapes").iterdir() if path.stat().st_mtime > died_at]
+    assert sorted(written) == list(FRAMES[2:])
+    assert sorted(call.frame_ids for call in summary.timings.calls) == [FRAMES[:3], FRAMES[3:]]
+    assert sorted(summary.frames) == list(FRAMES)
+    refine(root, tmp_path / "one", QuickRefiner(root), draw=blank, batch_frames=3, threads=1)
+    assert result_files(tmp_path / "two") == result_files(tmp_path / "one")
 
 
 def test_a_frame_that_kills_its_worker_fails_and_the_others_go_on(root: Path, tmp_path: Path) -> None:
