@@ -71,7 +71,8 @@ class RayEngine:
         try:
             ray.init(address, log_to_driver=False, logging_level="ERROR")
         except (ConnectionError, RuntimeError, ValueError) as error:
-            raise InputError("ray", "the address of a cluster that this machine belongs to", address) from error
+            found = f"{address} ({_last_line(error)})"
+            raise InputError("ray", "the address of a cluster that this machine belongs to", found) from error
         finally:
             # Ray lets SIGTERM end the process without its last words.
             if threading.current_thread() is threading.main_thread():
@@ -193,5 +194,5 @@ def _loaded(reference: Any) -> tuple[RunJob | None, str | None]:
 
 
 def _last_line(error: Exception) -> str:
-    """What an error on a node says, without the way there."""
-    return str(error).strip().splitlines()[-1]
+    """What an error of Ray says, without the way there."""
+    return (str(error).strip() or type(error).__name__).splitlines()[-1]

@@ -114,7 +114,7 @@ def forget_failures(out_dir: Path, frame_ids: Iterable[str]) -> None:
     wanted = set(frame_ids)
     for path in (out_dir / "failed").glob("*.txt"):
         if path.stem in wanted:
-            path.unlink()
+            path.unlink(missing_ok=True)
 
 
 def remove_stale_files(out_dir: Path) -> None:

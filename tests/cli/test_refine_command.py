@@ -31,7 +31,7 @@ def test_reports_cars_statuses_time_and_memory(kitti: Path, tmp_path: Path, caps
     for name in ("data/000001.txt", "shapes/000001.npz", "meshes/000001_1.glb", "overlays/000001.png"):
         assert (tmp_path / name).stat().st_size > 0
     timings = json.loads((tmp_path / "timings.json").read_text())
-    assert timings["schema_version"] == 1
+    assert timings["schema_version"] == 2
     assert timings["ms_per_car"] > 0
     assert sum(call["cars"] for call in timings["calls"]) == 4
     assert main(command(kitti, tmp_path)) == 0
