@@ -25,7 +25,7 @@ from directshape_torch.batch.resumption import (
     remove_stale_files,
 )
 from directshape_torch.batch.run_summary import RunSummary, RunTimings, digit_warnings, find_warnings, write_timings
-from directshape_torch.errors import DirectShapeError, InputError
+from directshape_torch.errors import InputError
 from directshape_torch.files.atomic_files import check_folder
 from directshape_torch.io.config_files import config_to_mapping
 from directshape_torch.io.result_files import read_shapes, write_tracks
