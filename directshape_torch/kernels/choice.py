@@ -71,7 +71,7 @@ def _is_installed() -> bool:
         _logger.warning("without native loops refinements on the CPU take 1.5 times as long (%s): %s", error, cure)
         return False
     if not jit.is_compiled(march.march):
-        _logger.warning("Numba compiles native loops once on this machine, which takes some 15 seconds")
+        _logger.warning("Numba compiles native loops once on this machine, which takes some 40 seconds")
     return True
 
 
