@@ -20,8 +20,6 @@ FORMATS = (
     "frame", "raw calibration", "sequence calibration", "summary", "results", "report", "status", "timings",
     "results of a frame",
 )  # fmt: skip
-# More of them, and what they cost: scripts/fuzz.py.
-TRIES = 12
 
 
 @pytest.fixture(scope="module")
@@ -31,15 +29,17 @@ def whole(shared_kitti: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[
     return found
 
 
+# More of them, and what they cost: scripts/fuzz.py.
+@pytest.mark.parametrize("tries", [4, pytest.param(100, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", FORMATS)
-def test_damaged_files(whole: dict[str, Sample], name: str) -> None:
+def test_damaged_files(whole: dict[str, Sample], name: str, tries: int) -> None:
     sample = whole[name]
     errors: list[DirectShapeError] = []
     content = sample.path.read_bytes()
     sample.read()
 
     @given(chance=st.randoms(use_true_random=False))
-    @settings(max_examples=TRIES, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=tries, suppress_health_check=list(HealthCheck))
     def read(chance: random.Random) -> None:
         sample.path.write_bytes(damaged(content, sample.path.name, chance))
         try:

@@ -3,28 +3,34 @@
 from __future__ import annotations
 
 import json
-import os
-import time
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 import fuzz
 import pytest
 from fuzzing import cases
+from helpers.bad_children import crashes, hangs
 
 from directshape_torch.errors import InputError
 
 
-def test_a_few_of_each_find_nothing_and_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert fuzz.main(["--calls", "10", "--files", "12", "--faults", "40", "--out", str(tmp_path)]) == 0
+@pytest.mark.parametrize("counts", [
+    {"calls": 10, "faults": 40},
+    pytest.param({"calls": 1000, "files": 1000, "kills": 4, "faults": 1}, marks=pytest.mark.long),
+], ids=["few", "many"])  # fmt: skip
+def test_what_was_tried_finds_nothing_and_is_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], counts: dict[str, int]
+) -> None:
+    words = [word for kind, count in counts.items() for word in (f"--{kind}", str(count))]
+    assert fuzz.main([*words, "--out", str(tmp_path)]) == 0
     figures = json.loads((tmp_path / "fuzz.json").read_text())
-    for kind, count in (("calls", 10), ("files", 12)):
-        assert figures[kind]["accepted"] + figures[kind]["refused"] == count
+    assert figures.keys() == counts.keys()
+    for kind in figures.keys() & {"calls", "files"}:
+        assert figures[kind]["accepted"] + figures[kind]["refused"] == counts[kind]
         assert figures[kind]["accepted"] > 0 < figures[kind]["refused"]
     faults = figures["faults"]
     assert faults["told by an error"] > 0
     assert faults["runs that did not go on to the same bytes"] == 0
-    assert "files    refused" in (tmp_path / "fuzz.txt").read_text()
+    assert "calls    refused" in (tmp_path / "fuzz.txt").read_text()
     assert (tmp_path / "fuzz.txt").read_text() in capsys.readouterr().out
 
 
@@ -46,18 +52,6 @@ def test_what_a_case_ends_with(error: Exception | None, outcome: str) -> None:
 
     assert cases.answer(lambda _: ("name", act), 7)["outcome"] == outcome
     assert cases.answer(lambda _: ("name", lambda: False), 7)["outcome"] == "silent NaN"
-
-
-def hangs(_: str, pipe: Connection) -> None:
-    pipe.send("ready")
-    pipe.recv()
-    time.sleep(60)
-
-
-def crashes(_: str, pipe: Connection) -> None:
-    pipe.send("ready")
-    pipe.recv()
-    os._exit(9)
 
 
 @pytest.mark.parametrize(("child", "outcome"), [(hangs, "hang"), (crashes, "crash")])

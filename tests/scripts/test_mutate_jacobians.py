@@ -138,8 +138,11 @@ def test_a_survivor_ends_the_command_with_1(
     assert capsys.readouterr().out.count("SURVIVED") == 4
 
 
-def test_a_sample_of_the_real_mutants_is_caught(capsys: pytest.CaptureFixture[str]) -> None:
-    """Of targets whose tests are quick: each collects them in a process of its own."""
-    words = ["--target", "projection", "--target", "robust", "--sample", "3", "--seed", "7", "--processes", "1"]
-    assert mutate_jacobians.main(words) == 0
-    assert "3 mutants: 3 caught" in capsys.readouterr().out
+@pytest.mark.parametrize("words", [
+    # Of a target whose tests are quick.
+    ["--target", "projection", "--sample", "2"],
+    pytest.param(["--sample", "60"], marks=pytest.mark.long),
+], ids=["few", "many"])  # fmt: skip
+def test_a_sample_of_the_real_mutants_is_caught(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert mutate_jacobians.main([*words, "--seed", "7", "--processes", "1"]) == 0
+    assert f"{words[-1]} mutants: {words[-1]} caught" in capsys.readouterr().out

@@ -56,7 +56,10 @@ def needs(mesh: trimesh.Trimesh, folder: Path, options: MeshOptions | None = Non
     return refused.value.cure
 
 
-@pytest.mark.parametrize("body_type", [name for name in BODY_TYPES if name != "pickup"])
+OTHERS = [pytest.param(name, marks=pytest.mark.long) for name in BODY_TYPES if name not in ("saloon", "pickup")]
+
+
+@pytest.mark.parametrize("body_type", ["saloon", *OTHERS])
 def test_every_turn_but_the_right_one_is_refused_with_the_right_one(body_type: str, tmp_path: Path) -> None:
     mesh = car(body_type)
     load_mesh_obj(saved(mesh, tmp_path))
