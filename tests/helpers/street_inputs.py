@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -30,6 +31,8 @@ SETTLED = replace(
         rays="marched",  # as every refinement that is differentiated
     ),
 )
+# Where it does not matter whether the gradient vanishes.
+UNSETTLED = replace(SETTLED, stages=(StageConfig(2.0, 1, 2), StageConfig(1.0, 0, 3)))
 
 
 class StreetInputs:
@@ -51,28 +54,36 @@ class StreetInputs:
         self.mean_direction = 0.02 * torch.ones_like(self.prior.mean)
 
     def refine(self, config: RefinerConfig, what: str = "nothing", by: Tensor | float = 0.0) -> RefinementResult:
+        return self.refine_by(config, {what: by})
+
+    def refine_by(self, config: RefinerConfig, steps: Mapping[str, Tensor | float]) -> RefinementResult:
+        """The result with each named input moved by its step."""
         frames, detections, weights = self.scene.frames, replace(self.detections, mask_left=self.mask), None
-        prior = self.prior
-        if what == "masks":
-            detections = replace(detections, mask_left=self.mask + by * self.mask_direction)
-        elif what == "images":
-            frames = replace(frames, images_right=frames.images_right + by * self.image_direction)
-        elif what == "weights":
-            weights = {"silhouette_left": torch.ones(len(detections), dtype=torch.float64) * (1 + by)}
-        elif what == "basis":
-            prior = _prior_with(basis=prior.basis + by * self.basis_direction)
-        elif what == "sigma":
-            sigma = 1 + by * torch.ones(prior.num_codes, dtype=torch.float64)
-            prior = _prior_with(basis=prior.basis * sigma, dimensions_basis_hwl=prior.dimensions_basis_hwl * sigma)
-        elif what == "mean":
-            prior = _prior_with(mean=prior.mean + by * self.mean_direction)
-        elif what == "dimensions":
-            detections = replace(detections, dimensions_hwl=detections.dimensions_hwl + by)
-        elif what == "pose":
-            shift = torch.zeros_like(detections.T_cam_obj)
-            shift[:, 0, 3] = 1.0
-            detections = replace(detections, T_cam_obj=detections.T_cam_obj + by * shift)
-        return DirectShapeRefiner(prior, config)(frames, detections, weights)
+        prior, of_prior = self.prior, {}
+        for what, by in steps.items():
+            if what == "masks":
+                detections = replace(detections, mask_left=self.mask + by * self.mask_direction)
+            elif what == "images":
+                frames = replace(frames, images_right=frames.images_right + by * self.image_direction)
+            elif what == "weights":
+                weights = {"silhouette_left": torch.ones(len(detections), dtype=torch.float64) * (1 + by)}
+            elif what == "basis":
+                of_prior["basis"] = of_prior.get("basis", prior.basis) + by * self.basis_direction
+            elif what == "sigma":
+                sigma = 1 + by * torch.ones(prior.num_codes, dtype=torch.float64)
+                of_prior["basis"] = of_prior.get("basis", prior.basis) * sigma
+                of_prior["dimensions_basis_hwl"] = prior.dimensions_basis_hwl * sigma
+            elif what == "mean":
+                of_prior["mean"] = prior.mean + by * self.mean_direction
+            elif what == "dimensions":
+                detections = replace(detections, dimensions_hwl=detections.dimensions_hwl + by)
+            elif what == "pose":
+                shift = torch.zeros_like(detections.T_cam_obj)
+                shift[:, 0, 3] = 1.0
+                detections = replace(detections, T_cam_obj=detections.T_cam_obj + by * shift)
+        refiner = DirectShapeRefiner(_prior_with(**of_prior) if of_prior else prior, config)
+        result: RefinementResult = refiner(frames, detections, weights)
+        return result
 
 
 def _prior_with(**tensors: Tensor) -> PCAShapePrior:
@@ -89,9 +100,18 @@ def summary(result: RefinementResult) -> Tensor:
 
 
 def gradient_by(inputs: StreetInputs, config: RefinerConfig, what: str) -> float:
-    by = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    (gradient,) = torch.autograd.grad(summary(inputs.refine(config, what, by)), by)
-    return float(gradient)
+    return gradients_by(inputs, config, [what])[what]
+
+
+def gradients_by(inputs: StreetInputs, config: RefinerConfig, names: Sequence[str]) -> dict[str, float]:
+    """The gradients of the summary of one refinement by several inputs."""
+    steps = {name: torch.zeros((), dtype=torch.float64, requires_grad=True) for name in names}
+    found = torch.autograd.grad(summary(inputs.refine_by(config, steps)), list(steps.values()))
+    return {name: float(gradient) for name, gradient in zip(names, found, strict=True)}
+
+
+def unsettled(mode: str) -> RefinerConfig:
+    return with_mode(mode, UNSETTLED, max_remaining_step=1e9)
 
 
 def with_mode(mode: str, config: RefinerConfig = SETTLED, **settings: float) -> RefinerConfig:

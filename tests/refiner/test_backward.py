@@ -7,7 +7,15 @@ from typing import Literal
 
 import pytest
 import torch
-from helpers.street_inputs import SETTLED, StreetInputs, gradient_by, summary, with_mode
+from helpers.street_inputs import (
+    SETTLED,
+    StreetInputs,
+    gradient_by,
+    gradients_by,
+    summary,
+    unsettled,
+    with_mode,
+)
 from helpers.synthetic_scene import joined_detections, joined_frames
 from torch import Tensor
 
@@ -24,10 +32,20 @@ def inputs() -> StreetInputs:
     return StreetInputs()
 
 
-@pytest.mark.parametrize("what", ["masks", "images", "weights", "basis", "mean", "sigma", "dimensions"])
-def test_modes_agree_with_each_other_and_with_differences(inputs: StreetInputs, what: str) -> None:
-    implicit = gradient_by(inputs, with_mode("implicit"), what)
-    unrolled = gradient_by(inputs, with_mode("unroll"), what)
+EVERYTHING = ("masks", "images", "weights", "basis", "mean", "sigma", "dimensions")
+
+
+@pytest.fixture(scope="module")
+def gradients(inputs: StreetInputs) -> dict[str, dict[str, float]]:
+    """The gradients of each mode by all inputs, of one refinement for each mode."""
+    return {mode: gradients_by(inputs, with_mode(mode), EVERYTHING) for mode in ("implicit", "unroll")}
+
+
+@pytest.mark.parametrize("what", EVERYTHING)
+def test_modes_agree_with_each_other_and_with_differences(
+    inputs: StreetInputs, gradients: dict[str, dict[str, float]], what: str
+) -> None:
+    implicit, unrolled = (gradients[mode][what] for mode in ("implicit", "unroll"))
     step = 1e-5
     ends = [float(summary(inputs.refine(SETTLED, what, sign * step))) for sign in (1, -1)]
     numeric = (ends[0] - ends[1]) / (2 * step)
@@ -38,9 +56,12 @@ def test_modes_agree_with_each_other_and_with_differences(inputs: StreetInputs, 
     assert abs(numeric - unrolled) < 1e-3 + 0.02 * abs(unrolled)
 
 
-def test_the_gauss_newton_matrix_is_near_but_not_equal(inputs: StreetInputs) -> None:
+def test_the_gauss_newton_matrix_is_near_but_not_equal(
+    inputs: StreetInputs, gradients: dict[str, dict[str, float]]
+) -> None:
     exact, approximate = (
-        gradient_by(inputs, with_mode(mode), "images") for mode in ("implicit", "implicit_gauss_newton")
+        gradients["implicit"]["images"],
+        gradient_by(inputs, with_mode("implicit_gauss_newton"), "images"),
     )
     assert 1e-4 < abs(approximate - exact) / abs(exact) < 0.5
 
@@ -96,7 +117,7 @@ def test_cars_that_fail_pass_their_input_through_and_leave_the_others_alone(
     T_cam_obj.requires_grad_()
     mask = inputs.mask.clone().requires_grad_()
     broken = replace(detections, T_cam_obj=T_cam_obj, mask_left=mask)
-    result = DirectShapeRefiner(inputs.prior, with_mode(mode))(inputs.scene.frames, broken)
+    result = DirectShapeRefiner(inputs.prior, unsettled(mode))(inputs.scene.frames, broken)
     assert not result.refined[1]
     by_pose, by_mask = torch.autograd.grad(result.T_cam_obj[:, :3, 3].sum(), [T_cam_obj, mask])
     only_the_position = torch.zeros(4, 4, dtype=torch.float64)
@@ -113,7 +134,7 @@ def test_a_nan_image_gives_no_nan_gradient(inputs: StreetInputs, mode: str) -> N
     images = frames.images_left.clone()
     images[1] = torch.nan
     mask = detections.mask_left.dense().requires_grad_()
-    refiner = DirectShapeRefiner(inputs.prior, with_mode(mode))
+    refiner = DirectShapeRefiner(inputs.prior, unsettled(mode))
     result = refiner(replace(frames, images_left=images), replace(detections, mask_left=mask))
     assert not result.refined[detections.frame_index == 1].any()
     (gradient,) = torch.autograd.grad(summary(result), mask)
@@ -129,7 +150,7 @@ def test_a_nan_pixel_that_nobody_needs_gives_no_nan_gradient(inputs: StreetInput
     known[0, :, 2, :] = False
     gain = torch.ones(3, 1, 1, dtype=torch.float64, requires_grad=True)
     images = torch.where(known, frames.images_left * gain, torch.nan)
-    result = DirectShapeRefiner(inputs.prior, with_mode(mode))(replace(frames, images_left=images), detections)
+    result = DirectShapeRefiner(inputs.prior, unsettled(mode))(replace(frames, images_left=images), detections)
     assert result.refined.all()
     (gradient,) = torch.autograd.grad(summary(result), gain)
     assert gradient.isfinite().all()

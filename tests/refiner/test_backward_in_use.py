@@ -11,7 +11,7 @@ import pytest
 import torch
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import DEFAULT
-from helpers.street_inputs import SETTLED, StreetInputs, gradient_by, summary, with_mode
+from helpers.street_inputs import SETTLED, UNSETTLED, StreetInputs, gradient_by, summary, unsettled, with_mode
 from helpers.synthetic_scene import cached_street, disturbed, masked
 from torch import Tensor
 
@@ -35,7 +35,7 @@ def inputs() -> StreetInputs:
 @pytest.mark.parametrize("mode", MODES)
 def test_the_result_is_that_without_gradients_to_the_bit(inputs: StreetInputs, mode: str) -> None:
     by = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    plain, attached = inputs.refine(SETTLED), inputs.refine(with_mode(mode), "masks", by)
+    plain, attached = inputs.refine(UNSETTLED), inputs.refine(unsettled(mode), "masks", by)
     assert torch.equal(plain.T_cam_obj, attached.T_cam_obj)
     assert torch.equal(plain.code, attached.code)
     assert plain.status == attached.status
@@ -46,17 +46,17 @@ def test_the_result_is_that_without_gradients_to_the_bit(inputs: StreetInputs, m
 def test_no_graph_without_a_mode_and_under_no_grad(inputs: StreetInputs) -> None:
     by = torch.zeros((), dtype=torch.float64, requires_grad=True)
     with pytest.warns(NoGradientWarning, match=r"detections.mask_left.* get no gradient: .* backward.mode=unroll"):
-        assert not inputs.refine(SETTLED, "masks", by).T_cam_obj.requires_grad
+        assert not inputs.refine(UNSETTLED, "masks", by).T_cam_obj.requires_grad
     with torch.no_grad():
-        assert not inputs.refine(with_mode("implicit"), "masks", by).T_cam_obj.requires_grad
+        assert not inputs.refine(unsettled("implicit"), "masks", by).T_cam_obj.requires_grad
     with torch.inference_mode():
-        assert not inputs.refine(with_mode("unroll")).T_cam_obj.requires_grad
+        assert not inputs.refine(unsettled("unroll")).T_cam_obj.requires_grad
 
 
 @pytest.mark.parametrize("mode", ["none", "unroll", "implicit"])
 def test_forward_mode_is_refused(inputs: StreetInputs, mode: str) -> None:
     """Tangents pass through what gradients are held back from: they would come out wrong, without a word."""
-    config = SETTLED if mode == "none" else with_mode(mode)
+    config = UNSETTLED if mode == "none" else unsettled(mode)
     frames, detections = inputs.scene.frames, replace(inputs.detections, mask_left=inputs.mask)
     refiner = DirectShapeRefiner(inputs.prior, config)
 
@@ -68,7 +68,7 @@ def test_forward_mode_is_refused(inputs: StreetInputs, mode: str) -> None:
 
 
 def test_a_constant_of_somebody_elses_derivative_is_refined(inputs: StreetInputs) -> None:
-    refiner = DirectShapeRefiner(inputs.prior, SETTLED)
+    refiner = DirectShapeRefiner(inputs.prior, UNSETTLED)
     frames, detections = inputs.scene.frames, replace(inputs.detections, mask_left=inputs.mask)
     one = torch.ones(1, dtype=torch.float64)
     found, tangent = torch.func.jvp(lambda x: x * refiner(frames, detections).T_cam_obj, (one,), (one,))
