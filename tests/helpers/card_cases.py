@@ -17,9 +17,11 @@ from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import on_a_gpu
 import torch
+from benchmark_suites.workloads import demo_scene
 from torch import Tensor
 
 from directshape_torch.cli.main import main as command
@@ -32,7 +34,10 @@ from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.scene.masks import MaskCrops
 from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.solver import gauss_newton
+from helpers.car_counts import with_cars
 from helpers.five_cars import five_cars, with_solver
+from helpers.kitti_folder import input_options, write_data_set
 from helpers.pretended_card import CARD, CardTensor, noted_waits, pretended_card
 from helpers.priors import prior_of
 from helpers.problems import DEFAULT, GEOMETRIC
@@ -126,23 +131,30 @@ def _difference(found: Tensor, expected: Tensor) -> float:
 
 
 def waits_of_blocks(tracks: bool = False) -> dict[str, Any]:
-    """Waits of the host between the begin and end of stages, in the iterations of a refinement."""
+    """Waits of the host, by operation, in calls of one and two blocks a stage, and in one that cars leave early."""
     prior, frames, detections = _numbered() if tracks else five_cars()
-    # Else all of the toys stay until the last block of a stage.
-    config = with_solver(_SHIPPED, cost_tolerance=0.01)
-    block = config.solver.block_iterations
-    refiner = DirectShapeRefiner(copy.deepcopy(prior).to(CARD), config)
     inputs = frames.to(CARD), detections.to(CARD)
-    refiner(*inputs)  # sends the constants
-    with noted_waits() as waits:
-        result = refiner(*inputs)
-    of_blocks = [wait for wait in waits if "_run_stage" in wait.functions and "start" not in wait.functions]
+    block = 2
+    # Else all of the toys stay until the last block of a stage.
+    leaving = with_solver(replace(_SHIPPED, check="off"), cost_tolerance=0.1, block_iterations=block)
+    staying = with_solver(leaving, cost_tolerance=0.0, step_tolerance=0.0)
+    of_config = _SHIPPED.stages[-1:] if tracks else _SHIPPED.stages
+
+    def counted(config: RefinerConfig, iterations: int) -> tuple[dict[str, int], list[int]]:
+        stages = tuple(replace(stage, max_iterations=iterations) for stage in of_config)
+        refiner = DirectShapeRefiner(copy.deepcopy(prior).to(CARD), replace(config, stages=stages))
+        with noted_waits() as waits, mock.patch.object(gauss_newton, "_WORTH_LEAVING_OUT", 1):
+            result = refiner(*inputs)
+        return Counter(waits), result.iterations.tolist()
+
+    counted(staying, 1)  # sends the constants
+    one, two, left = counted(staying, block), counted(staying, 2 * block), counted(leaving, 2 * block)
     return {
-        "blocks": sum(-(-stage.max_iterations // block) for stage in config.stages),
-        "iterations": result.iterations.tolist(),
-        "length of a block": block,
-        "in all": Counter(f"{wait.operation} in {' < '.join(wait.functions[:2])}" for wait in waits),
-        "by place": Counter(f"{wait.operation} in {wait.functions[0]}" for wait in of_blocks),
+        "stages": len(of_config),
+        "blocks of cars": [-(-count // block) for count in left[1]],
+        "one block": one[0],
+        "two blocks": two[0],
+        "cars leave": left[0],
     }
 
 
@@ -190,26 +202,43 @@ def waits_of_nothing() -> dict[str, Any]:
         assert isinstance(of_card + number, CardTensor)
         float(x.sum()), x.tolist(), x.nonzero(), x[x > 2], x.cpu(), torch.ones(2).to(CARD), x.new_tensor([1, 2])
         torch.linalg.eigh(torch.eye(2, device=CARD))
-    return {"problems": len(problems), "waits": [wait.operation for wait in waits]}
+    return {"problems": len(problems), "waits": waits}
 
 
-def demo() -> dict[str, list[str]]:
-    """Files of the demo that differ between the devices; the card has no native loops."""
+def run_of_files() -> dict[str, list[str]]:
+    """Files of a run over a data set that differ between the devices; the card has no native loops."""
     with tempfile.TemporaryDirectory() as folder, without_kernels():
         roots = [Path(folder) / device for device in ("cpu", "card")]
+        write_data_set(data := Path(folder) / "data", ("000000",))
         for root in roots:
-            assert command(["demo", "--out", str(root), "--device", root.name]) == 0
+            words = [*input_options(data)[:-1], root.name, "--rig", "none", "--overlays", "--meshes", "ply"]
+            assert command(["refine", *words, "--out", str(root)]) == 0
         names = sorted({str(p.relative_to(root)) for root in roots for p in root.rglob("*") if p.is_file()})
         _, differ, missing = filecmp.cmpfiles(*roots, names, shallow=False)
     return {"names": names, "differ": [*differ, *missing]}
 
 
 def page() -> str:
-    """The page of `scripts/on_a_gpu.py`."""
-    with tempfile.TemporaryDirectory() as folder, without_kernels():
+    """The page of `scripts/on_a_gpu.py`, for one car and few iterations."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        without_kernels(),
+        mock.patch.object(on_a_gpu, "_inputs", _one_car),
+        mock.patch.object(on_a_gpu, "load_config", _few_iterations),
+    ):
         file = Path(folder) / "gpu.md"
         assert on_a_gpu.main(["--device", "card", "--quick", "--out", str(file)]) == 0
         return file.read_text()
+
+
+def _one_car(num_frames: int) -> tuple[FrameBatch, Detections]:
+    return with_cars(demo_scene().frames, num_frames)
+
+
+def _few_iterations(preset: str, words: list[str]) -> RefinerConfig:
+    trusting = "acceptance={min_probability_better: 0, min_probability_not_worse: 0}"
+    stage = "stages=[{contour_width_px: 2, image_level: 1, max_iterations: 3}]"
+    return load_config(preset, [*words, trusting, stage, "search=off", "check=off"])
 
 
 CASES: dict[str, Callable[[], Any]] = {
@@ -220,7 +249,7 @@ CASES: dict[str, Callable[[], Any]] = {
     "waits of blocks of tracks": lambda: waits_of_blocks(tracks=True),
     "waits of masks": waits_of_masks,
     "the card itself": waits_of_nothing,
-    "demo": demo,
+    "run": run_of_files,
     "page": page,
 }
 

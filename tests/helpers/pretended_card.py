@@ -2,8 +2,8 @@
 
 `torch.device("card")` has every operation that PyTorch has on a CPU, computed there, so results are equal to the bit.
 But tensors of both devices cannot be mixed, numbers are copied only where the program says so, and each wait of the
-host for the device is noted with its place, as far as the names of operations reveal it. The device is stricter than a
-real card with indices on the CPU. It does not show properties of a real card such as other kernels, other orders of
+host for the device is noted, as far as the names of operations reveal it. The device is stricter than a real card with
+indices on the CPU. It does not show properties of a real card such as other kernels, other orders of
 sums and memory.
 
 The device belongs to the process that imports this module, so tests use it in a separate process (`card_cases`).
@@ -14,9 +14,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from types import FrameType
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -40,7 +38,6 @@ CARD = torch.device("card:0")
 
 # On a card tensors of a single number from the processor go with operations element by element, and with no others.
 _NO_SINGLE_NUMBERS = {"aten.cat", "aten.stack"}
-_PACKAGE = str(Path(gradient_mode.__file__).parents[1])
 # Their results, or the shapes of their results, are read by the host.
 WAITS = {
     "aten._local_scalar_dense",
@@ -63,35 +60,18 @@ WAITS = {
 INDEXED = {"aten.index", "aten.index_put", "aten.index_put_", "aten._index_put_impl_"}
 
 
-class Wait(NamedTuple):
-    """A `Wait` is one wait of the host."""
-
-    operation: str
-    functions: tuple[str, ...]  # of the package, from the one that asked outwards
-
-
-_waits: list[Wait] = []
+_waits: list[str] = []
 
 
 @contextmanager
-def noted_waits() -> Iterator[list[Wait]]:
-    """The waits in the body, in order."""
+def noted_waits() -> Iterator[list[str]]:
+    """The operations in the body for which the host waited, in order."""
     _waits.clear()
-    found: list[Wait] = []
+    found: list[str] = []
     try:
         yield found
     finally:
         found += _waits
-
-
-def _note(operation: str) -> None:
-    functions, frame = [], sys._getframe(1)
-    at: FrameType | None = frame
-    while at is not None:
-        if at.f_code.co_filename.startswith(_PACKAGE):
-            functions.append(at.f_code.co_name)
-        at = at.f_back
-    _waits.append(Wait(operation, tuple(functions)))
 
 
 class CardTensor(torch.Tensor):
@@ -122,7 +102,7 @@ class CardTensor(torch.Tensor):
 
     # PyTorch's own versions are for `torch.Tensor` alone.
     def tolist(self) -> Any:
-        _note("tolist")
+        _waits.append("tolist")
         return self.held.tolist()
 
     def __repr__(self, *, tensor_contents: object = None) -> str:
@@ -147,7 +127,7 @@ def _run(func: Any, *args: Any, **kwargs: Any) -> Any:
     leaves = name == "aten._to_copy" and device is not None and torch.device(device).type == "cpu"
     arrives = name == "aten._to_copy" and not on_card
     if leaves or arrives or unsized or name in WAITS or (name == "aten.copy_" and elsewhere) or _is_by_mask(name, args):
-        _note(name)
+        _waits.append(name)
     if device is not None:
         kwargs["device"] = torch.device("cpu")
     result = func(*tree_map(_held, args), **tree_map(_held, kwargs))
