@@ -93,7 +93,9 @@ def _ended(problem: CarProblem, state: CarState, start: CarState | None = None) 
     return minimise(problem, state, problem.config.solver, start)
 
 
-@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize(
+    "name", ["demo", *(pytest.param(name, marks=pytest.mark.long) for name in SETS if name != "demo")]
+)
 def test_the_cost_that_accepts_is_the_one_whose_gradient_made_it(name: str) -> None:
     """At the input and at the end; before, with the vertex of coarse samples: 5 percent in the median, 44 at most."""
     problem, state = DirectShapeRefiner(PCAShapePrior.load_bundled().double()).problem(*_first_frame_of(name))

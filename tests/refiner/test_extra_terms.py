@@ -60,27 +60,29 @@ def test_points_of_a_lidar_count_like_those_of_stereo() -> None:
     torch.testing.assert_close(extra.T_cam_obj, combined(scene.frames, detections).T_cam_obj, rtol=0, atol=1e-9)
 
 
+def heights(metres: Tensor | float, config: RefinerConfig, derived: bool = False) -> Tensor:
+    """The summed heights of the cars above a ground that is lower by so many metres."""
+    inputs, by_hand = StreetInputs(), lower_by(metres)
+    residual_of: Any = (lambda cars, state: by_hand(cars, state).residual) if derived else by_hand
+    detections = replace(inputs.detections, mask_left=inputs.mask)
+    refiner = DirectShapeRefiner(inputs.prior, config, [made(residual_of=residual_of, weight=100.0)])
+    result: RefinementResult = refiner(inputs.scene.frames, detections)
+    return result.T_cam_obj[:, 1, 3].sum()
+
+
+@cache
+def slope_of_heights() -> float:
+    step = 1e-5
+    return float(heights(step, SETTLED) - heights(-step, SETTLED)) / (2 * step)
+
+
 @pytest.mark.parametrize("derived", [False, True])
 @pytest.mark.parametrize("mode", ["implicit", "unroll"])
 def test_a_term_of_ones_own_carries_gradients(mode: str, derived: bool) -> None:
-    inputs = StreetInputs()
-
-    def residual_of(metres: Tensor | float) -> Any:
-        by_hand = lower_by(metres)
-        return (lambda cars, state: by_hand(cars, state).residual) if derived else by_hand
-
-    def heights(metres: Tensor | float, config: RefinerConfig) -> Tensor:
-        detections = replace(inputs.detections, mask_left=inputs.mask)
-        refiner = DirectShapeRefiner(inputs.prior, config, [made(residual_of=residual_of(metres), weight=100.0)])
-        result: RefinementResult = refiner(inputs.scene.frames, detections)
-        return result.T_cam_obj[:, 1, 3].sum()
-
     metres = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    (gradient,) = torch.autograd.grad(heights(metres, with_mode(mode)), metres)
-    step = 1e-5
-    numeric = float(heights(step, SETTLED) - heights(-step, SETTLED)) / (2 * step)
-    assert float(gradient) == pytest.approx(numeric, rel=1e-3)
-    assert numeric > 0.1
+    (gradient,) = torch.autograd.grad(heights(metres, with_mode(mode), derived), metres)
+    assert float(gradient) == pytest.approx(slope_of_heights(), rel=1e-3)
+    assert slope_of_heights() > 0.1
 
 
 def test_no_cars_need_no_rows() -> None:
