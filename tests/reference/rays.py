@@ -11,6 +11,8 @@ from torch import Tensor
 from directshape_torch.shape.shape_prior import BoundShape
 
 _SAMPLES = 128
+# Enough to find a surface; where one of them is near it, the least distance is searched with more.
+_COARSE = 48
 # Each round narrows the bracket to a quarter: 18 reach a billionth of the first one.
 _ROUNDS = 18
 
@@ -57,27 +59,30 @@ def least(distance: Callable[[Tensor], Tensor], near: Tensor, far: Tensor) -> Te
     return 0.5 * (near + far)
 
 
-def entry(distance: Callable[[Tensor], Tensor], near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
-    """Depth (P,) at which a function of depth first falls below zero, and whether it does."""
-    share = torch.linspace(0, 1, _SAMPLES + 1, dtype=near.dtype)
-    deepest = least(distance, near, far)
-    depths = torch.cat([near[:, None] + (far - near)[:, None] * share, deepest[:, None]], dim=1).sort(dim=1).values
-    inside = distance(depths) < 0
-    first = inside.to(torch.uint8).argmax(dim=1, keepdim=True)
-    # A ray that begins inside has no surface in front.
-    found = inside.any(dim=1) & (first[:, 0] > 0)
-    outer, inner = (depths.gather(1, (first - n).clamp_min(0))[:, 0] for n in (1, 0))
-    for _ in range(48):
-        middle = 0.5 * (outer + inner)
-        is_inside = distance(middle[:, None])[:, 0] < 0
-        outer, inner = torch.where(is_inside, outer, middle), torch.where(is_inside, middle, inner)
-    return inner, found
-
-
 def first_entry(rays: RaysObj, shape: BoundShape, bounds_obj: Tensor) -> tuple[Tensor, Tensor]:
     """Depth (P,) at which rays enter their car, and whether they do."""
     near, far, crosses = rays.interval(bounds_obj)
     depth, found = torch.ones_like(near), torch.zeros_like(crosses)
-    some = RaysObj(*(x[crosses] for x in rays))
-    depth[crosses], found[crosses] = entry(some.along(shape), near[crosses], far[crosses])
+    rows = crosses.nonzero()[:, 0]
+    samples = near[rows, None] + (far - near)[rows, None] * torch.linspace(0, 1, _COARSE + 1, dtype=near.dtype)
+    values = RaysObj(*(x[rows] for x in rays)).along(shape)(samples)
+    # Only where a sample is near the surface may a ray be inside between two that are not.
+    grazes = (values.amin(dim=1) >= 0) & (values.amin(dim=1) < 2 * (far - near)[rows] / _COARSE)
+    deepest = far[rows, None]
+    at = rows[grazes]
+    deepest[grazes, 0] = least(RaysObj(*(x[at] for x in rays)).along(shape), near[at], far[at])
+    samples, order = torch.cat([samples, deepest], dim=1).sort(dim=1)
+    of_deepest = RaysObj(*(x[rows] for x in rays)).along(shape)(deepest)
+    inside = torch.cat([values, of_deepest], dim=1).gather(1, order) < 0
+    first = inside.to(torch.uint8).argmax(dim=1, keepdim=True)
+    # A ray that begins inside has no surface in front.
+    enters = inside.any(dim=1) & (first[:, 0] > 0)
+    outer, inner = (samples.gather(1, (first - n).clamp_min(0))[enters, 0] for n in (1, 0))
+    at = rows[enters]
+    distance = RaysObj(*(x[at] for x in rays)).along(shape)
+    for _ in range(48):
+        middle = 0.5 * (outer + inner)
+        is_inside = distance(middle[:, None])[:, 0] < 0
+        outer, inner = torch.where(is_inside, outer, middle), torch.where(is_inside, middle, inner)
+    depth[at], found[at] = inner, True
     return depth, found

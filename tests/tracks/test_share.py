@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import pytest
@@ -109,6 +110,7 @@ def test_a_track_of_two_cars_is_split_where_they_were_swapped(monkeypatch: pytes
     assert torch.equal(swapped.code[4:], alone.code[4:])
 
 
+@cache
 def calm_drive() -> tuple[FrameBatch, Detections]:
     """Four frames of two cars of one shape and different paint."""
     code = torch.tensor([[0.9, -0.4, 0.5]] * 2, dtype=torch.float64)
