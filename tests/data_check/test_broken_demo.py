@@ -7,20 +7,20 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from helpers.matched_once import matched_once
 
 import directshape_torch
 from directshape_torch.cli.main import main
 from directshape_torch.data_check.check_dataset import check_dataset
 from directshape_torch.io.instance_masks import decode_segmentation
 from directshape_torch.io.stereo_dataset import open_dataset
-from directshape_torch.scene_check import check_images
 from directshape_torch.scene_check.finding import CheckReport
 
 DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
@@ -31,19 +31,8 @@ BOXES, MASKS, PLANE = "detections/data/000000.txt", "training/masks/000000.json"
 
 
 @pytest.fixture(scope="module", autouse=True)
-def match_once() -> Any:
-    """Cache matches by image content, because matching is slow and most breaks do not change the images."""
-    answers: dict[bytes, Any] = {}
-    match_pair = check_images.match_pair
-
-    def remembered(*images: Any) -> Any:
-        key = b"".join(image.tobytes() for image in images)
-        if key not in answers:
-            answers[key] = match_pair(*images)
-        return answers[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(check_images, "match_pair", remembered)
+def match_once() -> Iterator[None]:
+    with matched_once():
         yield
 
 

@@ -44,14 +44,20 @@ def test_a_mistake_in_one_frame_is_named(name: str) -> None:
     assert named(MISTAKES[name], report), report
 
 
+MORE = (
+    *(("kitti15", name, "training/masks") for name in ("noisy_stereo", "noisy_mono", "biased_mono")),
+    *(("kitti", name, "training/masks") for name in ("noisy_stereo", "noisy_mono")),
+    ("rendered", "stereo", "training/masks"),
+)
+
+
 @needs_data
 @pytest.mark.parametrize(
     ("data", "detections", "masks"),
     [
-        *(("kitti15", name, "training/masks") for name in ("noisy_stereo", "noisy_mono", "biased_mono", "pointrcnn")),
-        *(("kitti", name, "training/masks") for name in ("noisy_stereo", "noisy_mono")),
-        ("rendered", "stereo", "training/masks"),
+        ("kitti15", "pointrcnn", "training/masks"),
         ("rendered", "mono", "masks_degraded"),
+        *(pytest.param(*one, marks=pytest.mark.long) for one in MORE),
     ],
 )
 def test_correct_frames_raise_no_alarm(data: str, detections: str, masks: str) -> None:
@@ -64,7 +70,10 @@ def test_correct_frames_raise_no_alarm(data: str, detections: str, masks: str) -
 
 
 @needs_data
-@pytest.mark.parametrize(("data", "detections"), [("rendered", "stereo"), ("kitti15", "noisy_stereo")])
+@pytest.mark.parametrize(
+    ("data", "detections"),
+    [("kitti15", "noisy_stereo"), pytest.param("rendered", "stereo", marks=pytest.mark.long)],
+)
 @pytest.mark.parametrize(
     "name", ["heading in degrees", "heading off by 180 degrees", "focal length 0.8 times too short"]
 )
