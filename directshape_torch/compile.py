@@ -24,7 +24,7 @@ CompileMode = Literal["on", "off"]
 # operation while the written part is read.
 _OPTIONS: dict[str, str | int | bool | Callable[..., object]] = {"inplace_buffers": False}
 # A function has a form for each kind of size, field that is missing, dtype and number; PyTorch keeps 8 by itself, and
-# goes on without compiling where a function needs more.
+# goes on without compiling where a function needs more. The number can be given since PyTorch 2.13.
 _MOST_FORMS = 64
 
 _P = ParamSpec("_P")
@@ -65,8 +65,8 @@ def check_compiler(device: torch.device) -> None:
             _compiled(lambda x: x + 1)(torch.ones(2, device=device))
     except Exception as error:  # PyTorch's compiler can raise anything, and whatever it is there is no compiler.
         reason = next((line for line in map(str.strip, str(error).splitlines()) if line), type(error).__name__)
-        message = f"compile: on needs a compiler that works on {device.type}, but {reason}; set compile to off"
-        raise CompilationError(message) from error
+        needed = f"PyTorch 2.13 or later and a compiler that works on {device.type}"
+        raise CompilationError(f"compile: on needs {needed}, but {reason}; set compile to off") from error
 
 
 def compilable(function: Callable[_P, _R]) -> Callable[_P, _R]:

@@ -18,8 +18,11 @@ _R = TypeVar("_R")
 
 # "none" means that nobody has asked for fewer digits.
 _FULL = ("none", "ieee")
-# The newer name of the setting, `fp32_precision`, can be asked here, too, where old and new names were mixed.
-_PRODUCTS = (torch.backends.cuda.matmul, torch.backends.mkldnn.matmul)  # type: ignore[attr-defined]
+# The newer name of the setting, `fp32_precision` (since PyTorch 2.9), can be asked here, too, where old and new names
+# were mixed.
+_PRODUCTS: tuple[Any, ...] = ()
+if hasattr(torch.backends, "fp32_precision"):
+    _PRODUCTS = torch.backends.cuda.matmul, torch.backends.mkldnn.matmul  # type: ignore[attr-defined]
 
 
 def _suspend() -> Callable[[], None]:

@@ -10,21 +10,26 @@ import torch
 
 from directshape_torch.numerics.full_precision import full_precision, in_full_precision
 
-CUDA, CPU = torch.backends.cuda.matmul, torch.backends.mkldnn.matmul
+CUDA, CPU = torch.backends.cuda.matmul, getattr(torch.backends.mkldnn, "matmul", None)
+HAS_NEWER_NAME = hasattr(torch.backends, "fp32_precision")
+needs_newer_name = pytest.mark.skipif(not HAS_NEWER_NAME, reason="PyTorch is older than 2.9")
 
 
 @pytest.fixture(autouse=True)
 def _as_it_was() -> Iterator[None]:
     yield
-    torch.backends.fp32_precision = CUDA.fp32_precision = CPU.fp32_precision = "none"
+    if HAS_NEWER_NAME:
+        torch.backends.fp32_precision = CUDA.fp32_precision = CPU.fp32_precision = "none"
     torch.set_float32_matmul_precision("highest")
-    CUDA.fp32_precision = CPU.fp32_precision = "none"
+    if HAS_NEWER_NAME:
+        CUDA.fp32_precision = CPU.fp32_precision = "none"
 
 
 def seen() -> tuple[str, str]:
     return CUDA.fp32_precision, CPU.fp32_precision
 
 
+@needs_newer_name
 @pytest.mark.parametrize("asked", ["highest", "high", "medium"])
 def test_fewer_digits_are_not_allowed_inside_and_again_afterwards(asked: str) -> None:
     torch.set_float32_matmul_precision(asked)
@@ -36,6 +41,7 @@ def test_fewer_digits_are_not_allowed_inside_and_again_afterwards(asked: str) ->
     assert (asked == "highest") == (set(before) <= {"none", "ieee"})
 
 
+@needs_newer_name
 def test_the_newer_name_of_the_setting() -> None:
     CUDA.fp32_precision = "tf32"
     with full_precision():
@@ -43,6 +49,7 @@ def test_the_newer_name_of_the_setting() -> None:
     assert CUDA.fp32_precision == "tf32"
 
 
+@needs_newer_name
 def test_what_follows_the_setting_of_all_backends_goes_on_following_it() -> None:
     torch.backends.fp32_precision = "tf32"
     with full_precision():
@@ -65,7 +72,7 @@ def test_the_last_thread_to_leave_puts_the_setting_back() -> None:
     with full_precision():
         thread.start()
         assert entered.wait(10)
-    assert CUDA.fp32_precision == "ieee"
+    assert torch.get_float32_matmul_precision() == "highest"
     may_leave.set()
     thread.join()
     assert torch.get_float32_matmul_precision() == "high"
