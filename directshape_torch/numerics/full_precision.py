@@ -133,8 +133,8 @@ def in_full_precision(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 def _dtype_of(values: tuple[object, ...]) -> torch.dtype:
     """The dtype in which values are computed."""
-    first = next((value.dtype for value in values if _is_floating(value)), torch.float32)
-    return working_dtype(first)
+    floating = [value.dtype for value in values if _is_floating(value)]
+    return working_dtype(floating[0] if floating else torch.float32)
 
 
 def _of_dtype(value: Any, dtype: torch.dtype) -> Any:
