@@ -64,7 +64,7 @@ def check_compiler(device: torch.device) -> None:
         with warnings.catch_warnings(action="ignore"):
             _compiled(lambda x: x + 1)(torch.ones(2, device=device))
     except Exception as error:  # PyTorch's compiler can raise anything, and whatever it is there is no compiler.
-        reason = next((line for line in map(str.strip, str(error).splitlines()) if line), type(error).__name__)
+        reason = _first_line(error)
         needed = f"PyTorch 2.13 or later and a compiler that works on {device.type}"
         raise CompilationError(f"compile: on needs {needed}, but {reason}; set compile to off") from error
 
@@ -92,9 +92,19 @@ def compilable(function: Callable[_P, _R]) -> Callable[_P, _R]:
     def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
         # The user's compiler cannot ask the rest, so this comes first.
         is_plain = torch.compiler.is_compiling() or not _is_on.get() or not nothing_is_differentiated()
-        return function(*args, **kwargs) if is_plain else compiled()(*args, **kwargs)
+        if is_plain:
+            return function(*args, **kwargs)
+        try:
+            return compiled()(*args, **kwargs)
+        except Exception as error:  # PyTorch's compiler can raise anything.
+            message = f"compile: on failed in {function.__qualname__}: {_first_line(error)}; set compile to off"
+            raise CompilationError(message) from error
 
     return call
+
+
+def _first_line(error: Exception) -> str:
+    return next((line for line in map(str.strip, str(error).splitlines()) if line), type(error).__name__)
 
 
 def _compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:

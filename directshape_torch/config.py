@@ -355,8 +355,9 @@ class RefinerConfig(Settings):
     search: Literal["rescue", "always", "off"] = setting(
         "rescue",
         'find cars by their masks and disparity where the given box does not lead to them: "rescue" (cars that end '
-        'refuted by the images, far from their box or beside their mask), "always" (every car, in several times the '
-        'time) or "off"; it needs silhouettes and photometry, and leaves tracks alone',
+        'refuted by the images, far from their box or beside their mask), "always" (every car whose '
+        'mask leads out of the reach of its box) or "off"; it needs silhouettes and photometry, and leaves tracks '
+        "alone",
     )
     stages: tuple[StageConfig, ...] = (
         StageConfig(contour_width_px=2.0, image_level=1, max_iterations=6, over_relaxation=1.6),

@@ -96,6 +96,7 @@ class LocalEngine:
         # If a thread started the tracker, it would unblock interrupts in that thread.
         resource_tracker.ensure_running()
         self._threads = ThreadPoolExecutor(workers, initializer=_block_interrupts)
+        self._is_ending = False
         self._executors: SimpleQueue[ProcessPoolExecutor | None] = SimpleQueue()
         for _ in range(workers):
             self._executors.put(None)
@@ -113,6 +114,7 @@ class LocalEngine:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._is_ending = True
         self._threads.shutdown(cancel_futures=True)
         while self._executors.qsize():
             if (executor := self._executors.get()) is not None:
@@ -127,7 +129,7 @@ class LocalEngine:
                 return executor.submit(_refine_here, group).result()
             except BrokenProcessPool:
                 executor = None
-                if attempt == self.tries:
+                if attempt == self.tries or self._is_ending:
                     raise
             finally:
                 self._executors.put(executor)
@@ -196,4 +198,10 @@ def _take_job(content: bytes) -> str | None:
 
 
 def _refine_here(group: FrameGroup) -> GroupReport:
-    return refine_group(_jobs[0], group)
+    try:
+        return refine_group(_jobs[0], group)
+    except DirectShapeError:
+        raise
+    # An error of a user's own code that the parent cannot read would look like the death of this process.
+    except Exception as error:
+        raise DirectShapeError(f"{type(error).__name__}: {error}") from None

@@ -60,6 +60,8 @@ class RayEngine:
 
     def __init__(self, job: RunJob, address: str) -> None:
         check_cluster(address, job.refiner.prior.origin.device)
+        # Ray counts processes that were killed for memory by themselves, and without this number repeats them for ever.
+        os.environ.setdefault("RAY_task_oom_retries", str(self.tries - 1))
         try:
             import ray
         except ImportError as error:
@@ -77,11 +79,13 @@ class RayEngine:
             # Ray lets SIGTERM end the process without its last words.
             if threading.current_thread() is threading.main_thread():
                 signal.signal(signal.SIGTERM, before)
-        self._offer = ray.put(offer)
-        self._task = ray.remote(num_cpus=threads, max_retries=self.tries - 1)(_refine_there)
-        nodes = [node for node in ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
-        self.workers = max(1, int(sum(node["Resources"]["CPU"] for node in nodes)) // threads)
         try:
+            self._offer = ray.put(offer)
+            self._task = ray.remote(num_cpus=threads, max_retries=self.tries - 1)(_refine_there)
+            nodes = [node for node in ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
+            self.workers = sum(int(node["Resources"]["CPU"]) // threads for node in nodes)
+            if not self.workers:
+                raise InputError("threads", "at most the processors of a node of the cluster", str(threads))
             write_text(self._mark, self._mark.name)
             self._check(nodes)
         except BaseException:
@@ -94,6 +98,9 @@ class RayEngine:
         return future
 
     def report(self, future: Future[GroupReport]) -> GroupReport | None:
+        # Other runs into the folder remove temporary files that nobody has touched for an hour.
+        with suppress(OSError):
+            os.utime(self._mark)
         try:
             return future.result()
         except self._ray.exceptions.RayTaskError as error:

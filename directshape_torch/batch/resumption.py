@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -64,10 +65,28 @@ def join_summary(out_dir: Path, manifest: RunManifest) -> None:
     Raises:
         ResumeError: another run has begun in the folder, with other settings.
     """
-    if (previous := read_manifest(summary_path(out_dir))) is not None:
-        check_resume(previous, manifest)
-        manifest = replace(manifest, frames=sorted({*previous.frames, *manifest.frames}))
-    write_manifest(summary_path(out_dir), manifest)
+    with _locked(out_dir):
+        if (previous := read_manifest(summary_path(out_dir))) is not None:
+            check_resume(previous, manifest)
+            manifest = replace(manifest, frames=sorted({*previous.frames, *manifest.frames}))
+        write_manifest(summary_path(out_dir), manifest)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Let other runs that begin or end at the same moment wait, where the system can lock a folder."""
+    try:
+        import fcntl
+    except ImportError:  # Only Unix has it.
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # Some network disks have no locks.
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def finished_frames(

@@ -26,7 +26,7 @@ TIMINGS_SCHEMA_VERSION = 2
 _CPU = torch.device("cpu")
 # A warning names at most this many cars without a mask.
 _NAMED = 3
-_PACKAGES = ("directshape_torch", "torch", "numpy", "opencv-python-headless", "scipy")
+_PACKAGES = ("directshape_torch", "torch", "numpy", "opencv-python-headless", "scipy", "numba")
 # The last digits of a result depend on these entries of `timings.json`.
 _DIGITS = ("versions", "threads", "batch_frames", "device")
 

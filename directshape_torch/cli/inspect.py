@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     """Draw the pictures that the options ask for."""
     check_folder("out", args.out)
     dataset = _dataset(args)
-    # Compiling does not pay for one frame, and pictures need no graphics card.
+    # Pictures need no graphics card.
     refiner = make_refiner(args.config, args.set, args.prior, "cpu")
     refiner.rig = RigEstimates(known_rigs(args.rig))
     if args.tracks:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,7 +46,10 @@ def read_status(out_dir: Path | str, now: float | None = None) -> RunStatus:
     if manifest is None:
         raise DataFormatError(path, "is missing, so no run of 'directshape refine' is or was here")
     began_at, frames = path.stat().st_mtime, set(manifest.frames)
-    ended_at = {name: shapes_path(out_dir, name).stat().st_mtime for name in done_frames(out_dir) if name in frames}
+    ended_at = {}
+    for name in frames.intersection(done_frames(out_dir)):
+        with suppress(FileNotFoundError):  # A run that begins afresh has just removed it.
+            ended_at[name] = shapes_path(out_dir, name).stat().st_mtime
     recent = sorted(at for at in ended_at.values() if at >= began_at)
     failures = [name for name in sorted(frames.difference(ended_at)) if failure_path(out_dir, name).is_file()]
     failed = {name: read_failure(out_dir, name) for name in failures}

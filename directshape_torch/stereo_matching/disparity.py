@@ -85,8 +85,9 @@ def with_disparity(frames: FrameBatch, frame_index: Tensor | None = None, extent
     Args:
         frames: F frames; the images pass through the CPU as 8-bit images.
         frame_index: (M,) numbers of the frames to match, in any order and number; other frames get NaN. None means all.
-        extents: (M, 4) the parts of these frames to match, as first and last columns and rows (u0, v0, u1, v1); what
-            is far from all parts gets NaN. None means whole frames.
+        extents: (M, 4) the parts of these frames to match (u0, v0, u1, v1), half open; what is far from all parts gets
+            NaN. As much is matched below a part as the part is high, because the lower end of a car may be hidden
+            there. None means whole frames.
     """
     if frames.disparity is not None:
         return frames
@@ -109,12 +110,8 @@ def _apart(parts: list[list[int]], height: int, width: int) -> list[list[int]]:
     for u0, v0, u1, v1 in parts:
         if u0 >= u1 or v0 >= v1:
             continue
-        part = [
-            max(u0 - _AROUND_PX, 0),
-            max(v0 - _AROUND_PX, 0),
-            min(u1 + _AROUND_PX, width),
-            min(v1 + _AROUND_PX, height),
-        ]
+        first, last = [max(u0 - _AROUND_PX, 0), max(v0 - _AROUND_PX, 0)], v1 + (v1 - v0) + _AROUND_PX
+        part = [*first, min(u1 + _AROUND_PX, width), min(last, height)]
         while (other := next((each for each in apart if _overlap(each, part)), None)) is not None:
             apart.remove(other)
             part = [*map(min, part[:2], other[:2]), *map(max, part[2:], other[2:])]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -10,9 +11,11 @@ from helpers.kitti_folder import FRAMES
 from helpers.output_folders import result_files
 from helpers.quick_runs import refine
 
+from directshape_torch.batch.resumption import join_summary
 from directshape_torch.errors import ResumeError
 from directshape_torch.io.config_files import load_config
-from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.io.run_folder import RunFolder, summary_path
+from directshape_torch.io.run_manifest import RunManifest, read_manifest
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.visualize.overlay import overlay_of_frame
@@ -86,3 +89,12 @@ def test_results_without_a_summary_are_not_overwritten(shared_kitti: Path, tmp_p
     ):
         refine(shared_kitti, tmp_path)
     assert (tmp_path / "data" / "000000.txt").read_text() == "mine\n"
+
+
+def test_runs_that_begin_together_are_all_in_the_summary(tmp_path: Path) -> None:
+    manifests = [RunManifest("0", {}, {"prior": "a", "stereo_bias": None}, [f"{n:06d}"]) for n in range(8)]
+    with ThreadPoolExecutor(len(manifests)) as threads:
+        list(threads.map(lambda manifest: join_summary(tmp_path, manifest), manifests))
+    written = read_manifest(summary_path(tmp_path))
+    assert written is not None
+    assert written.frames == [f"{n:06d}" for n in range(8)]

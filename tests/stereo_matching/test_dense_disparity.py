@@ -48,3 +48,21 @@ def test_only_frames_that_are_needed_are_matched() -> None:
     torch.testing.assert_close(one[1], every[1], rtol=0, atol=0, equal_nan=True)
     assert one[0].isnan().all()
     assert none.isnan().all()
+
+
+def test_a_part_is_matched_with_its_surroundings_and_what_lies_below_it() -> None:
+    frames = cached_street()[1].frames
+    extents = torch.tensor([[90, 40, 110, 50], [5, 5, 5, 20]])  # The second part is empty.
+    whole, part = with_disparity(frames).disparity, with_disparity(frames, torch.tensor([0, 0]), extents).disparity
+    assert whole is not None
+    assert part is not None
+    matched = part[0].isfinite()
+    (rows, columns) = (matched.any(dim=dim).nonzero()[:, 0] for dim in (1, 0))
+    assert int(rows[0]) >= 0
+    assert int(columns[0]) >= 90 - 48
+    assert int(columns[-1]) < 110 + 48
+    # Next to the part nearly all disparities are those of the whole images.
+    near = (slice(30, 70), slice(80, 120))
+    same = torch.isclose(part[0][near], whole[0][near], atol=0.25, rtol=0, equal_nan=True)
+    assert same.double().mean() > 0.97
+    assert not with_disparity(frames, torch.tensor([0]), extents[1:]).disparity.isfinite().any()  # type: ignore[union-attr]
