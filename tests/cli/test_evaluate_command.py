@@ -66,7 +66,7 @@ def test_json(folders: tuple[str, str], tmp_path: Path) -> None:
     assert len(first["precision"]) == len(first["orientation"]) == 41
     assert len(first["thresholds"]) == len(first["recall"]) == 40
     text = (Path(__file__).parents[2] / "docs" / "file_formats.md").read_text(encoding="utf-8")
-    documented = text[text.index("## Scores (`evaluate") : text.index("## Shape scores (`evaluate-shape")]
+    documented = text[text.index("- **`evaluate --json") : text.index("- **`evaluate-shape --json")]
     for name in (*content, *content["scores"][0]):
         assert name == "schema_version" or f"`{name}`" in documented
 

@@ -150,7 +150,7 @@ def test_command(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert len(rows) == 2 * 20
     assert float(rows[0]["completeness_after"]) > 0.99
     documented = (Path(__file__).parents[2] / "docs" / "file_formats.md").read_text(encoding="utf-8")
-    documented = documented[documented.index("## Shape scores (`evaluate-shape") :]
+    documented = documented[documented.index("- **`evaluate-shape --json") :]
     assert content.pop("schema_version") == 1
     assert all(f"`{name}`" in documented for part in (content, content["curves"][0]) for name in part)
     assert all(f"`{re.sub('_(before|after)$', '', name)}`" in documented for name in rows[0])

@@ -32,9 +32,11 @@ def test_lower_bounds_are_dropped_and_nothing_else(tmp_path: Path) -> None:
     before = tomllib.loads((tmp_path / "pyproject.toml").read_text("utf-8"))
     script.drop_bounds(tmp_path / "pyproject.toml")
     after = tomllib.loads((tmp_path / "pyproject.toml").read_text("utf-8"))
-    bounded = before["project"].pop("dependencies")
-    assert after["project"].pop("dependencies") == [name.partition(">=")[0] for name in bounded]
-    assert any(">=" in name for name in bounded)
+    extras = before["project"].pop("optional-dependencies"), after["project"].pop("optional-dependencies")
+    bounded = [before["project"].pop("dependencies"), *extras[0].values()]
+    found = [after["project"].pop("dependencies"), *extras[1].values()]
+    assert found == [[name.partition(">=")[0] for name in names] for names in bounded]
+    assert any(">=" in name for name in bounded[0])
     assert after["project"] == before["project"]
 
 
