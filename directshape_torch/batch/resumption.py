@@ -80,6 +80,7 @@ def _locked(folder: Path) -> Iterator[None]:
     except ImportError:  # Only Unix has it.
         yield
         return
+    folder.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         with suppress(OSError):  # Some network disks have no locks.
