@@ -5,6 +5,7 @@ from __future__ import annotations
 import reprlib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 _LONGEST_MESSAGE = 2000
 _LONGEST_PART = 400
@@ -15,6 +16,14 @@ class DirectShapeError(Exception):
 
     def __init__(self, message: str = "") -> None:
         super().__init__(shortened(message, _LONGEST_MESSAGE))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Other processes make the error of its message, whatever its constructor takes.
+        return _made_anew, (type(self), self.args), vars(self)
+
+
+def _made_anew(kind: type[DirectShapeError], args: tuple[object, ...]) -> DirectShapeError:
+    return kind.__new__(kind, *args)
 
 
 class InputError(DirectShapeError, ValueError):

@@ -19,8 +19,10 @@ from directshape_torch.batch.frame_outputs import write_failure
 from directshape_torch.batch.group_refinement import GroupReport, RunJob, refine_group, set_threads
 from directshape_torch.errors import DirectShapeError
 
-# If this many groups for each process are lost before any frame is finished, single frames are not the cause.
-_HOPELESS_GROUPS = 3
+# A process may be killed by chance, because others take the memory.
+_TRIES = 2
+# If this many frames for each process are lost before any frame is finished, single frames are not the cause.
+_HOPELESS_FRAMES = 3
 _DEATH = "killed, out of memory or crashed"
 
 
@@ -28,14 +30,13 @@ class Engine(Protocol):
     """An `Engine` refines groups by processes, which end with the body."""
 
     workers: int  # processes side by side
-    tries: int  # how often a group is tried whose process dies
 
     def submit(self, group: FrameGroup) -> Future[GroupReport]:
         """Hand out a group; any number of groups may wait."""
         ...
 
     def report(self, future: Future[GroupReport]) -> GroupReport | None:
-        """The report of a group that has ended, or None if its process died each time; errors of the run raise."""
+        """The report of a group that has ended, or None if its process died; errors of the run raise."""
         ...
 
     def __enter__(self) -> Self: ...
@@ -46,37 +47,38 @@ class Engine(Protocol):
 def reports_of(engine: Engine, job: RunJob, groups: Sequence[FrameGroup]) -> Iterator[GroupReport]:
     """Reports of the groups of a run, in the order in which they end.
 
-    A group whose process died each time is handed out in halves, down to single frames, which have failed. Frames that
-    were finished in spite of it are not repeated, since `refine_group` finds their files.
+    A group whose process died is handed out again, then in halves, down to single frames, which have failed. Frames
+    that were finished in spite of it are not repeated, since `refine_group` finds their files.
 
     Raises:
         DirectShapeError: processes die before any of them has finished a frame.
     """
     ended: SimpleQueue[Future[GroupReport]] = SimpleQueue()
-    at_work: dict[Future[GroupReport], FrameGroup] = {}
+    at_work: dict[Future[GroupReport], tuple[FrameGroup, int]] = {}
     num_lost, has_report = 0, False
 
-    def hand_out(more: Sequence[FrameGroup]) -> None:
+    def hand_out(more: Sequence[FrameGroup], attempt: int = 1) -> None:
         for group in more:
             future = engine.submit(group)
-            at_work[future] = group
+            at_work[future] = group, attempt
             future.add_done_callback(ended.put)
 
     hand_out(groups)
     while at_work:
         future = ended.get()
-        group = at_work.pop(future)
+        group, attempt = at_work.pop(future)
         if (report := engine.report(future)) is not None:
             has_report = True
             yield report
-            continue
-        num_lost += 1
-        if not has_report and num_lost >= _HOPELESS_GROUPS * engine.workers:
-            raise DirectShapeError(f"workers die before they finish any frame ({_DEATH}); is there enough memory?")
-        if len(group.frame_ids) > 1:
+        elif attempt < _TRIES:
+            hand_out([group], attempt + 1)
+        elif len(group.frame_ids) > 1:
             hand_out(group.halves())
         else:
-            reason = f"its worker died each of {engine.tries} times ({_DEATH})"
+            num_lost += 1
+            if not has_report and num_lost >= _HOPELESS_FRAMES * engine.workers:
+                raise DirectShapeError(f"workers die before they finish any frame ({_DEATH}); is there enough memory?")
+            reason = f"its worker died each of {_TRIES} times ({_DEATH})"
             yield GroupReport({lost: write_failure(job.out_dir, lost, reason) for lost in group.wanted})
 
 
@@ -87,16 +89,12 @@ class LocalEngine:
     own group. At the end of the body the processes finish their groups. They also end whenever this process ends.
     """
 
-    # A process may be killed by chance, because others take the memory.
-    tries = 2
-
     def __init__(self, job: RunJob, workers: int) -> None:
         # Bytes make sure that tensors are copied and not shared.
         self._job, self.workers = pickled(job), workers
         # If a thread started the tracker, it would unblock interrupts in that thread.
         resource_tracker.ensure_running()
         self._threads = ThreadPoolExecutor(workers, initializer=_block_interrupts)
-        self._is_ending = False
         self._executors: SimpleQueue[ProcessPoolExecutor | None] = SimpleQueue()
         for _ in range(workers):
             self._executors.put(None)
@@ -114,26 +112,21 @@ class LocalEngine:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._is_ending = True
         self._threads.shutdown(cancel_futures=True)
         while self._executors.qsize():
             if (executor := self._executors.get()) is not None:
                 executor.shutdown()
 
     def _refine(self, group: FrameGroup) -> GroupReport:
-        for attempt in range(1, self.tries + 1):
-            executor = self._executors.get()
-            try:
-                if executor is None:
-                    executor = self._started()
-                return executor.submit(_refine_here, group).result()
-            except BrokenProcessPool:
-                executor = None
-                if attempt == self.tries or self._is_ending:
-                    raise
-            finally:
-                self._executors.put(executor)
-        raise AssertionError("the last attempt returns or raises")
+        executor = self._executors.get()
+        try:
+            executor = executor or self._started()
+            return executor.submit(_refine_here, group).result()
+        except BrokenProcessPool:
+            executor = None
+            raise
+        finally:
+            self._executors.put(executor)
 
     def _started(self) -> ProcessPoolExecutor:
         """An executor of one process that has read the job."""

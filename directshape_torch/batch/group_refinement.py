@@ -70,11 +70,7 @@ def refine_group(job: RunJob, group: FrameGroup) -> GroupReport:
     found = {name: done_entry(job.out_dir, name, job.run, job.options.outputs) for name in sorted(group.wanted)}
     ends = {name: entry for name, entry in found.items() if entry is not None}
     step = _GroupStep(job, group.without(ends))
-    try:
-        step.refine(group.frame_ids)
-    except STOPS_THE_RUN as error:
-        # Other processes may not be able to read errors of other classes.
-        raise DirectShapeError(_reason(error)) from error
+    step.refine(group.frame_ids)
     # Frames that were finished before stay in the call, for the sake of the bytes of the others.
     step.report.ends |= ends
     timings = step.report.timings

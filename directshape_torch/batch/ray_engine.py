@@ -45,7 +45,7 @@ class _Offer:
 class RayEngine:
     """A `RayEngine` hands groups to the nodes of a cluster, each of which must have the package and see the same files.
 
-    Ray repeats what dead processes and nodes held. The body ends the job on the cluster.
+    The body ends the job on the cluster.
 
     Args:
         job: job whose paths all nodes see.
@@ -56,12 +56,8 @@ class RayEngine:
         InputError: the address is wrong or does not answer, the device is no CPU, or a node cannot do the job.
     """
 
-    tries = 4
-
     def __init__(self, job: RunJob, address: str) -> None:
         check_cluster(address, job.refiner.prior.origin.device)
-        # Ray counts processes that were killed for memory by themselves, and without this number repeats them for ever.
-        os.environ.setdefault("RAY_task_oom_retries", str(self.tries - 1))
         try:
             import ray
         except ImportError as error:
@@ -81,7 +77,8 @@ class RayEngine:
                 signal.signal(signal.SIGTERM, before)
         try:
             self._offer = ray.put(offer)
-            self._task = ray.remote(num_cpus=threads, max_retries=self.tries - 1)(_refine_there)
+            # Ray itself would repeat processes that are killed for memory for ever.
+            self._task = ray.remote(num_cpus=threads, max_retries=0)(_refine_there)
             nodes = [node for node in ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
             self.workers = sum(int(node["Resources"]["CPU"]) // threads for node in nodes)
             if not self.workers:

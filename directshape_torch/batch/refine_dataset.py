@@ -115,6 +115,7 @@ class _Run:
         self._look_for_files()
         if has_tracks(self.dataset):
             self._write_tracks(sorted(name for name, entry in self.ends.items() if "reason" not in entry))
+        # A folder that another run has taken, or that was moved away, is found here.
         join_summary(self.out_dir, manifest)
         return self._summary(resumed)
 

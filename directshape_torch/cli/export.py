@@ -8,7 +8,6 @@ Rerun's viewer. OUT itself is only read. docs/outputs.md gives the coordinate fr
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 from directshape_torch.cli.options import add_run_inputs, inputs_of_run, mask_source
@@ -80,5 +79,4 @@ def _make_refiner(args: argparse.Namespace, inputs: RunInputs) -> DirectShapeRef
             raise InputError(f"--{name}", "that of the run, for --iterations", "nothing")
     if inputs.prior is None:
         raise InputError("--prior", "the shape prior of the run", "nothing")
-    config = replace(inputs.run.refiner_config(), compile="off")
-    return DirectShapeRefiner(inputs.prior, config, rig=RigEstimates(known_rigs(args.rig)))
+    return DirectShapeRefiner(inputs.prior, inputs.run.refiner_config(), rig=RigEstimates(known_rigs(args.rig)))

@@ -69,7 +69,8 @@ class CarProblem(Table):
     @property
     def photometric(self) -> PhotometricEvidence | None:
         """The library's photometric evidence; None if it has no part in the energy."""
-        return next((each for each in self.evidence if isinstance(each, PhotometricEvidence)), None)
+        found = next((each for each in self.evidence if "photometric" in each.names), None)
+        return cast("PhotometricEvidence | None", found)
 
     def parts(
         self, terms: tuple[AnyTerm, ...], field: Field, state: State, anchors: tuple[object, ...], fisher: bool = True

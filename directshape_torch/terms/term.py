@@ -102,6 +102,11 @@ class Term(Table, Protocol[AnchorT]):
         return False
 
     @property
+    def is_of_state(self) -> bool:
+        """Whether this is a `PriorTerm`, whose residual is a function of the state alone."""
+        return False
+
+    @property
     def blocks(self) -> Blocks:
         """M blocks of R rows."""
         ...
@@ -258,7 +263,6 @@ def parts_of(
     terms: tuple[AnyTerm, ...], field: Field, state: State, anchors: tuple[object, ...], fisher: bool = True
 ) -> tuple[Part[Any], ...]:
     """The parts of all terms at a state, with hand-derived Jacobians, near their anchors."""
-
     native = [term.native_part(field, state, at, fisher) for term, at in zip(terms, anchors, strict=True)]
     rest = [n for n, part in enumerate(native) if part is None]
     others = iter(_parts_of(tuple(terms[n] for n in rest), field, state, tuple(anchors[n] for n in rest), fisher))

@@ -36,7 +36,7 @@ DONE: FrameEntry = {"cars": 1}
 class Imagined:
     """An `Imagined` has one worker that dies as it is told."""
 
-    workers, tries = 1, 2
+    workers = 1
 
     def __init__(self, dies: Callable[[FrameGroup], bool]) -> None:
         self.dies = dies
@@ -66,7 +66,8 @@ def test_the_frame_that_kills_is_found_among_its_companions(tmp_path: Path) -> N
         **dict.fromkeys("abdefgh", DONE),
         "c": {"reason": reason},
     }
-    assert workers.calls == [tuple("abcd"), tuple("efgh"), tuple("ab"), tuple("cd"), ("c",), ("d",)]
+    names = ["abcd", "efgh", "abcd", "ab", "cd", "cd", "c", "d", "c"]
+    assert workers.calls == [tuple(each) for each in names]
     assert read_failure(tmp_path, "c") == reason
 
 
@@ -74,6 +75,13 @@ def test_workers_that_never_finish_anything_end_the_run(tmp_path: Path) -> None:
     with pytest.raises(DirectShapeError, match=r"workers die before they finish any frame \(killed"):
         ends(Imagined(lambda _: True), tmp_path)
     assert sorted(path.stem for path in (tmp_path / "failed").iterdir()) == ["a", "b"]
+
+
+def test_a_killer_in_each_half_of_one_group_does_not_end_the_run(tmp_path: Path) -> None:
+    workers = Imagined(lambda group: not {"c", "f"}.isdisjoint(group.frame_ids))
+    found = ends(workers, tmp_path, size=8)
+    assert sorted(name for name, entry in found.items() if "reason" in entry) == ["c", "f"]
+    assert len(found) == 8
 
 
 refine = partial(quick_runs.refine, meshes="ply")
@@ -166,6 +174,21 @@ def test_a_worker_without_the_memory_for_a_call_halves_it(root: Path, tmp_path: 
     assert sorted(call.frame_ids for call in summary.timings.calls) == [(frame_id,) for frame_id in FRAMES]
     refine(root, tmp_path / "one", QuickRefiner(root), batch_frames=1, threads=1)
     assert result_files(tmp_path / "hungry") == result_files(tmp_path / "one")
+
+
+class OfTwoWordsError(Exception):
+    def __init__(self, one: str, other: str) -> None:
+        super().__init__(f"{one} {other}")
+
+
+def draw_nothing(*_: object) -> NDArray[np.uint8]:
+    raise OfTwoWordsError("no", "paint")
+
+
+def test_an_error_of_a_users_code_is_told_and_is_no_death(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(DirectShapeError, match="OfTwoWordsError: no paint"):
+        refine(root, tmp_path, QuickRefiner(root), draw=draw_nothing, batch_frames=1, workers=1)
+    assert multiprocessing.active_children() == []
 
 
 class Interrupter(RunObserver):

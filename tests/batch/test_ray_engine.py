@@ -18,8 +18,8 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import quick_runs
-from helpers.kitti_folder import write_data_set
 from helpers.output_folders import result_files
+from helpers.run_fixtures import SIX_FRAMES as FRAMES
 
 import directshape_torch
 from directshape_torch.batch.options import RefineOptions
@@ -30,17 +30,14 @@ from directshape_torch.io.run_folder import done_frames
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="ends processes as Linux does")
 TESTS = Path(__file__).parent.parent
 PACKAGE = Path(directshape_torch.__file__).parent.parent
-FRAMES = tuple(f"{number:06d}" for number in range(6))
 _PATIENCE_S = 180.0
 
 refine = partial(quick_runs.refine, threads=1)
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("kitti")
-    write_data_set(root, FRAMES)
-    return root
+def root(kitti_of_six: Path) -> Path:
+    return kitti_of_six
 
 
 @pytest.fixture(scope="module")

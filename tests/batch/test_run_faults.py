@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 from helpers import quick_runs
 from helpers.faulty_refiners import FEW_STEPS, QuickRefiner
-from helpers.kitti_folder import write_data_set
 from helpers.output_folders import result_files
+from helpers.run_fixtures import SIX_FRAMES as FRAMES
 
 import directshape_torch
 from directshape_torch.batch.options import RefineOptions, RunObserver
@@ -29,16 +29,13 @@ from directshape_torch.io.run_folder import done_frames
 from directshape_torch.io.run_status import read_status
 
 refine = partial(quick_runs.refine, threads=1)
-FRAMES = tuple(f"{number:06d}" for number in range(6))
 TESTS = Path(__file__).parent.parent
 _PATIENCE_S = 120.0
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("kitti")
-    write_data_set(root, FRAMES)
-    return root
+def root(kitti_of_six: Path) -> Path:
+    return kitti_of_six
 
 
 @pytest.fixture(scope="module")

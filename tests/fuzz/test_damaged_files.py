@@ -51,7 +51,7 @@ def test_damaged_files(whole: dict[str, Sample], name: str, tries: int) -> None:
 
     read()
     for error in errors:
-        # Of a whole folder it may be a file, or the prior, that does not fit the damaged one.
+        # In a whole folder another file, or the prior, may not fit the damaged one.
         of_others = "/out/" in str(error) or "that of the run" in str(error) or isinstance(error, ResumeError)
         assert sample.path.stem in str(error) or of_others
         assert len(str(error)) < 2500

@@ -27,6 +27,17 @@ def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+SIX_FRAMES = tuple(f"{number:06d}" for number in range(6))
+
+
+@pytest.fixture(scope="session")
+def kitti_of_six(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The data set with six frames, of which some are left when a run is ended."""
+    root = tmp_path_factory.mktemp("kitti")
+    write_data_set(root, SIX_FRAMES)
+    return root
+
+
 @pytest.fixture
 def kitti_copy(shared_kitti: Path, tmp_path: Path) -> Path:
     """A copy of the data set that a test may damage."""

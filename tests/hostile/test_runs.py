@@ -151,5 +151,7 @@ def test_a_run_that_is_asked_to_end_says_so(tmp_path: Path) -> None:
         _, said = run.communicate(timeout=60)
     finally:
         run.kill()
-    assert (run.returncode, said.splitlines()[-1]) == (143, "directshape: terminated")
+    # The message stands behind the bar if the signal arrives while the bar is drawn.
+    assert run.returncode == 143
+    assert said.endswith("directshape: terminated\n")
     assert read_status(out).num_left > 0

@@ -139,7 +139,7 @@ def test_a_survivor_ends_the_command_with_1(
 
 
 @pytest.mark.parametrize("words", [
-    # Of a target whose tests are quick.
+    # The tests of this target are quick.
     ["--target", "projection", "--sample", "2"],
     pytest.param(["--sample", "60"], marks=pytest.mark.long),
 ], ids=["few", "many"])  # fmt: skip
