@@ -107,6 +107,7 @@ def run(args: argparse.Namespace) -> None:
         _thresholds(judged, limits),
         _reliability(judged),
         _coverage(judged),
+        *([_by_one_root(runs, judged, limits)] if left_out else []),
         _noises({"all": of_all, **({"without " + " ".join(row): models[row] for row in rows} if left_out else {})}),
     ]
     write_text(args.out / "report.md", "\n\n".join(parts) + "\n")
@@ -162,6 +163,22 @@ def _policies(rows: Rows, limits: AcceptanceConfig) -> str:
         cells += [_count(there), _count([after < each.before - WORSE_BY for after, each in pairs])]
         counts = f"{len(cars)}, {np.mean([len(each.before) for each in cars]):.0f}"
         lines.append(f"| {root} {detector} | {counts} | {inputs} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _by_one_root(runs: Sequence[Cars], rows: Rows, limits: AcceptanceConfig) -> str:
+    """Table of returned boxes where a row is judged by the other detectors of one other root alone."""
+    roots = list(dict.fromkeys(root for root, _ in rows))
+    lines = ["| returned, judged by one root | " + " | ".join(roots) + " |", "|---" * (1 + len(roots)) + "|"]
+    for row in rows:
+        cells = []
+        for root in roots:
+            some = [run for run in others_of(runs, row) if run.root == root]
+            cells.append("")
+            if some:
+                judged = _judged(runs, row, fitted(some))
+                cells[-1] = _cell(judged.cars, judged.chosen(judged.cars, limits), with_spread=False)
+        lines.append(f"| {' '.join(row)} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
