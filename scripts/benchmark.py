@@ -3,7 +3,7 @@
     python scripts/benchmark.py                                  # times, operations, memory of whole calls
     python scripts/benchmark.py --profile                        # one refinement, by part
     python scripts/benchmark.py --native                         # with native loops over without them
-    python scripts/benchmark.py --compiled                       # with `compile: on` over off
+    python scripts/benchmark.py --set compile=on                 # with other settings over the defaults
     python scripts/benchmark.py --against ../other_checkout      # times and operations of this version over another's
 
 Frames come from DIRECTSHAPE_DATA (or --data), else from the bundled demo frame. `on_a_gpu.py` measures a graphics card.
@@ -53,14 +53,14 @@ def run(args: argparse.Namespace) -> None:
 
         show(against_rows(args.against, root, args.quick))
     if args.native:
-        from benchmark_suites.native_loops import native_rows
+        from benchmark_suites.in_turn import native_rows
 
         show(list(native_rows(root, args.quick)))
-    if args.compiled:
-        from benchmark_suites.native_loops import compiled_rows
+    if args.set:
+        from benchmark_suites.in_turn import setting_rows
 
-        show(list(compiled_rows(root, args.quick)))
-    if not (args.profile or args.native or args.compiled or args.against):
+        show(list(setting_rows(args.set, root, args.quick)))
+    if not (args.profile or args.native or args.set or args.against):
         scenes = load_scenes(root, 1 if args.quick else None)
         show([row for scene in scenes for row in time_rows(scene, rounds, args.quick)])
 
@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--profile", action="store_true", help="time and operations of one refinement by part")
     parser.add_argument("--native", action="store_true", help="with native loops over without them, in turn")
-    parser.add_argument("--compiled", action="store_true", help="with `compile: on` over off, in turn")
+    parser.add_argument("--set", nargs="+", metavar="KEY=VALUE", help="with these settings over the defaults, in turn")
     parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="this version over another one, in turn")
     parser.add_argument("--data", type=Path, metavar="ROOT", help="default: DIRECTSHAPE_DATA")
     parser.add_argument("--quick", action="store_true", help="see that everything runs; no figures to quote")

@@ -9,7 +9,7 @@ from pathlib import Path
 import benchmark
 import pytest
 import torch
-from benchmark_suites import checkouts, native_loops, stage_profile, workloads
+from benchmark_suites import checkouts, in_turn, stage_profile, workloads
 from benchmark_suites.measures import count_operations, peak_tensor_bytes
 from benchmark_suites.stage_profile import PARTS, profile_parts
 from benchmark_suites.timing import Row, Spread, time_interleaved
@@ -75,7 +75,7 @@ def one_car(monkeypatch: pytest.MonkeyPatch) -> None:
     """The benchmark refines one car of the bundled frame."""
     scene = workloads.demo_scene()
     scene = replace(scene, frames=(first_cars(scene.frames[0], 1),))
-    for module in (benchmark, native_loops):
+    for module in (benchmark, in_turn):
         monkeypatch.setattr(module, "load_scenes", lambda *_: (scene,))
     monkeypatch.setattr(stage_profile, "demo_scene", lambda: scene)
 
@@ -158,7 +158,7 @@ def test_a_version_against_itself() -> None:
 
 @pytest.mark.usefixtures("one_car")
 def test_native_loops_against_tensor_operations() -> None:
-    rows: list[Row] = list(native_loops.native_rows(None, quick=True))
+    rows: list[Row] = list(in_turn.native_rows(None, quick=True))
     assert [row.name.split(", ")[-1] for row in rows] == ["time", "mm between ends"]
     assert rows[0].spread.median < 1
     assert 0 < rows[1].spread.median < 0.1

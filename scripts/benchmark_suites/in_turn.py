@@ -1,4 +1,4 @@
-"""This module runs `--native` and `--compiled`: refinements one way over refinements another way, in one process.
+"""This module runs `--native` and `--set`: refinements one way over refinements another way, in one process.
 
 The calls are made in turn, and processor time is compared, so that other load on the machine slows down both.
 """
@@ -6,7 +6,7 @@ The calls are made in turn, and processor time is compared, so that other load o
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from statistics import median
 
@@ -37,10 +37,9 @@ def native_rows(data_root: Path | None, quick: bool = False) -> Iterator[Row]:
     return _rows(data_root, quick, refiner, by_tensor_operations)
 
 
-def compiled_rows(data_root: Path | None, quick: bool = False) -> Iterator[Row]:
-    """With `compile: on` over off, both with native loops where there are any."""
-    on, off = (DirectShapeRefiner(config=load_config(None, [f"compile={mode}"])) for mode in ("on", "off"))
-    return _rows(data_root, quick, on, off)
+def setting_rows(settings: Sequence[str], data_root: Path | None, quick: bool = False) -> Iterator[Row]:
+    """With other settings over the defaults, both with native loops where there are any."""
+    return _rows(data_root, quick, DirectShapeRefiner(config=load_config(None, settings)), DirectShapeRefiner())
 
 
 def _rows(data_root: Path | None, quick: bool, one: _Refine, other: _Refine) -> Iterator[Row]:
