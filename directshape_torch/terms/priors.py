@@ -60,8 +60,6 @@ class PriorTerm(Term[NoAnchor]):
     # Further values that the residual needs for each car are tensors (N, ...) of all N detections of the call.
     values: Mapping[str, Tensor] = field(default_factory=dict)
 
-    is_of_state = True
-
     def __post_init__(self) -> None:
         called, depth = f"extra term {self.name!r}", self.cars.input_depth
         if not isinstance(self.weight, (int, float)):
@@ -153,8 +151,8 @@ def with_joined_priors(terms: Sequence[AnyTerm]) -> tuple[AnyTerm, ...]:
 
     Each `PriorTerm` of the library has a Jacobian. A joined one needs fewer operations.
     """
-    priors = cast("list[PriorTerm]", [term for term in terms if term.is_of_state])
-    others = [term for term in terms if not term.is_of_state]
+    priors = [term for term in terms if isinstance(term, PriorTerm)]
+    others = [term for term in terms if not isinstance(term, PriorTerm)]
     return (*others, _joined(priors)) if priors else tuple(others)
 
 

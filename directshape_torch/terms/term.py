@@ -102,11 +102,6 @@ class Term(Table, Protocol[AnchorT]):
         return False
 
     @property
-    def is_of_state(self) -> bool:
-        """Whether this is a `PriorTerm`, whose residual is a function of the state alone."""
-        return False
-
-    @property
     def blocks(self) -> Blocks:
         """M blocks of R rows."""
         ...

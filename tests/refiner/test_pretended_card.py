@@ -22,23 +22,32 @@ pytestmark = pytest.mark.skipif(
 )
 
 _TESTS = Path(__file__).parents[1]
-_COMPARED = [
-    "default",
+_COMPARED = ["default", "tracks, unrolled gradients"]
+_ALSO_COMPARED = [
     "product form, marched rays",
     "point cloud",
     "implicit gradients",
     "neural prior, other residuals and priors, every step",
-    "tracks, unrolled gradients",
 ]
+_WAITS = ["waits of blocks", "waits of blocks of tracks", "waits of masks", "the card itself"]
 
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    return _found(tmp_path_factory, [*_COMPARED, *_WAITS])
+
+
+@pytest.fixture(scope="module")
+def also_found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    return _found(tmp_path_factory, [*_ALSO_COMPARED, "run", "page"])
+
+
+def _found(tmp_path_factory: pytest.TempPathFactory, cases: list[str]) -> dict[str, Any]:
     """The results of `helpers.card_cases`, computed once in a separate process, to which the device belongs."""
     file = tmp_path_factory.mktemp("card") / "found.json"
     paths = [str(_TESTS), str(_TESTS.parent), str(_TESTS.parent / "scripts"), os.environ.get("PYTHONPATH", "")]
     done = subprocess.run(
-        [sys.executable, "-m", "helpers.card_cases", str(file)],
+        [sys.executable, "-m", "helpers.card_cases", str(file), *cases],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
@@ -46,8 +55,8 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         timeout=600,
     )
     assert done.returncode == 0, done.stderr
-    cases: dict[str, Any] = json.loads(file.read_text())
-    return cases
+    figures: dict[str, Any] = json.loads(file.read_text())
+    return figures
 
 
 def _of(found: dict[str, Any], case: str) -> dict[str, Any]:
@@ -58,6 +67,16 @@ def _of(found: dict[str, Any], case: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize("case", _COMPARED)
 def test_a_card_gives_the_results_of_the_processor_to_the_bit(found: dict[str, Any], case: str) -> None:
+    _check_same(found, case)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("case", _ALSO_COMPARED)
+def test_a_card_gives_these_results_to_the_bit_too(also_found: dict[str, Any], case: str) -> None:
+    _check_same(also_found, case)
+
+
+def _check_same(found: dict[str, Any], case: str) -> None:
     differences = _of(found, case)
     assert len(differences) > 20
     assert {name for name, largest in differences.items() if largest != 0} == set()
@@ -98,16 +117,18 @@ def test_many_masks_let_the_host_wait_no_more_often_than_few(found: dict[str, An
         assert few == many <= 8
 
 
-def test_a_run_writes_the_same_files(found: dict[str, Any]) -> None:
-    run = _of(found, "run")
+@pytest.mark.long
+def test_a_run_writes_the_same_files(also_found: dict[str, Any]) -> None:
+    run = _of(also_found, "run")
     assert len(run["names"]) > 5
     # These name the device, and what it took.
     assert run["differ"] == ["timings.json"]
 
 
-def test_the_page_for_a_card_has_results_gradients_and_times(found: dict[str, Any]) -> None:
-    assert not isinstance(found["page"], dict), found["page"]["error"]
-    rows = dict(line.strip("| ").split(" | ") for line in found["page"].splitlines() if line.startswith("| "))
+@pytest.mark.long
+def test_the_page_for_a_card_has_results_gradients_and_times(also_found: dict[str, Any]) -> None:
+    assert not isinstance(also_found["page"], dict), also_found["page"]["error"]
+    rows = dict(line.strip("| ").split(" | ") for line in also_found["page"].splitlines() if line.startswith("| "))
     for name in ("given boxes", "masks alone"):
         assert rows[f"{name}: cars with the CPU's status"] == "1 of 1"
         assert rows[f"{name}: median distance from the CPU's place"] == "0 mm"
