@@ -52,6 +52,9 @@ A, B, R = "{data}/kitti15", "{data}/kitti", "{data}/rendered"
 K15, K, EXACT, DEGRADED = f"{A}/training/masks", f"{B}/training/masks", f"{R}/training/masks", f"{R}/masks_degraded"
 _UNKNOWN = "--rig none --set rig.disparity_sigma_px=0.3"
 _LIDAR = "--rig {out}/lidar_rig.json"
+_IMAGES_ALONE = (
+    "--set priors.detector_weight=0 acceptance.min_probability_better=0 acceptance.min_probability_not_worse=0"
+)
 _EXACT_RIG = "--rig none --set search=off rig.disparity_sigma_px=0"
 
 GIVEN_BOXES = {
@@ -67,6 +70,7 @@ GIVEN_BOXES = {
     "k15_pointrcnn_exact_rig": Refinement(A, K15, f"{A}/detections/pointrcnn", _EXACT_RIG),
     "k15_stereo_exact_rig": Refinement(A, K15, f"{A}/detections/noisy_stereo", _EXACT_RIG),
     "rendered_stereo": Refinement(R, EXACT, f"{R}/detections/stereo"),
+    "rendered_stereo_images_alone": Refinement(R, EXACT, f"{R}/detections/stereo", _IMAGES_ALONE),
     "rendered_mono_degraded": Refinement(R, DEGRADED, f"{R}/detections/mono"),
 }
 MASKS_ALONE = {
@@ -86,7 +90,9 @@ MASKS_ALONE = {
     "masks_degraded_exact_rig": Refinement(R, DEGRADED, None, "--rig none"),
 }
 _TRUST = "scripts/calibrate_trust.py --workers {workers} --out {out}/"
-_POSE = f"scripts/reproduce_tables.py pose --data {R} --masks {EXACT} --rows default paper geometric combined"
+_POSE = f"scripts/reproduce_tables.py pose --data {R} --masks {EXACT} --rows geometric paper combined 'images alone'"
+_ABLATION = "scripts/reproduce_tables.py ablation"
+_SHAPES = f"-m directshape_torch evaluate-shape --data {R} --detections {R}/detections/stereo --masks {EXACT} --refined"
 OTHERS = {
     "trust": f"{_TRUST}trust --cars {A} {A}/detections/pointrcnn {K15} --cars {A} stereo {K15} --cars {A} mono {K15} "
     f"--cars {A} {A}/detections/biased_mono {K15} --cars {B} {B}/detections/pointrcnn {K} --cars {B} stereo {K} "
@@ -97,17 +103,21 @@ OTHERS = {
     "wrong_boxes": f"scripts/wrong_boxes.py --data {R} --detections {R}/detections/stereo --masks {EXACT}",
     "paper_stereo": f"{_POSE} --detections {R}/detections/stereo --out {{out}}/paper_stereo",
     "paper_mono": f"{_POSE} --detections {R}/detections/mono --out {{out}}/paper_mono",
+    "ablation_near": f"{_ABLATION} --data {R} --masks {EXACT} --detections {R}/detections/stereo --out {{out}}/near",
+    "ablation_far": f"{_ABLATION} --data {R} --masks {EXACT} --detections {R}/detections/mono --out {{out}}/far",
+    "ablation_kitti": f"{_ABLATION} --data {B} --masks {K} --detections {B}/detections/noisy_stereo --out {{out}}/kitti",
     "heading": f"scripts/calibrate_heading.py --run {A} {{out}}/masks_k15_lidar_rig "
     f"--run {B} {{out}}/masks_k_lidar_rig --run {R} {{out}}/masks_rendered --run {R} {{out}}/masks_degraded",
-    "shapes": f"-m directshape_torch evaluate-shape --data {R} --detections {R}/detections/stereo --masks {EXACT} "
-    "--refined {out}/rendered_stereo",
+    "shapes": f"{_SHAPES} {{out}}/rendered_stereo",
+    "shapes_images_alone": f"{_SHAPES} {{out}}/rendered_stereo_images_alone",
 }
 REFINEMENTS = {**GIVEN_BOXES, **MASKS_ALONE}
 # Commands of one group run side by side; each group needs files of those before it.
 GROUPS = (
     ("lidar_rig",),
     tuple(name for name in REFINEMENTS if name != "masks_k15_6"),
-    ("masks_k15_6", "wrong_boxes", "heading", "shapes", "paper_stereo", "paper_mono"),
+    ("masks_k15_6", "wrong_boxes", "heading", "shapes", "shapes_images_alone", "paper_stereo", "paper_mono"),
+    ("ablation_near", "ablation_far", "ablation_kitti"),
     ("trust_by_frame",),
     ("trust",),
 )

@@ -36,6 +36,7 @@ BOX_ALIGNMENT = "box alignment"
 METHODS = {
     DEFAULT: "",
     "input where not trusted": "--trusted",
+    "images alone": "priors.detector_weight=0",
     "paper": "--config paper",
     "fast": "--config fast",
     "geometric": "--config geometric",
