@@ -105,7 +105,7 @@ OTHERS = {
     "paper_mono": f"{_POSE} --detections {R}/detections/mono --out {{out}}/paper_mono",
     "ablation_near": f"{_ABLATION} --data {R} --masks {EXACT} --detections {R}/detections/stereo --out {{out}}/near",
     "ablation_far": f"{_ABLATION} --data {R} --masks {EXACT} --detections {R}/detections/mono --out {{out}}/far",
-    "ablation_kitti": f"{_ABLATION} --data {B} --masks {K} --detections {B}/detections/noisy_stereo --out {{out}}/kitti",
+    "ablation_kitti": f"{_ABLATION} --data {B} --masks {K} --detections {B}/detections/noisy_stereo --out {{out}}/k",
     "heading": f"scripts/calibrate_heading.py --run {A} {{out}}/masks_k15_lidar_rig "
     f"--run {B} {{out}}/masks_k_lidar_rig --run {R} {{out}}/masks_rendered --run {R} {{out}}/masks_degraded",
     "shapes": f"{_SHAPES} {{out}}/rendered_stereo",
