@@ -4,6 +4,7 @@
     python scripts/benchmark.py --profile                        # one refinement, by part
     python scripts/benchmark.py --native                         # with native loops over without them
     python scripts/benchmark.py --set compile=on                 # with other settings over the defaults
+    python scripts/benchmark.py --peers                          # PyPose's and Theseus's solvers over this library's
     python scripts/benchmark.py --against ../other_checkout      # times and operations of this version over another's
 
 Frames come from DIRECTSHAPE_DATA (or --data), else from the bundled demo frame. `on_a_gpu.py` measures a graphics card.
@@ -35,6 +36,7 @@ def run(args: argparse.Namespace) -> None:
 
     Raises:
         InputError: the data or checkout does not exist.
+        MissingDependencyError: `--peers` without the libraries that it compares with.
     """
     if args.threads is not None:
         if args.threads < 1:
@@ -60,7 +62,11 @@ def run(args: argparse.Namespace) -> None:
         from benchmark_suites.in_turn import setting_rows
 
         show(list(setting_rows(args.set, root, args.quick)))
-    if not (args.profile or args.native or args.set or args.against):
+    if args.peers:
+        from benchmark_suites.peers import peer_rows
+
+        show(list(peer_rows(root, args.quick)))
+    if not (args.profile or args.native or args.set or args.peers or args.against):
         scenes = load_scenes(root, 1 if args.quick else None)
         show([row for scene in scenes for row in time_rows(scene, rounds, args.quick)])
 
@@ -93,6 +99,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--profile", action="store_true", help="time and operations of one refinement by part")
     parser.add_argument("--native", action="store_true", help="with native loops over without them, in turn")
     parser.add_argument("--set", nargs="+", metavar="KEY=VALUE", help="with these settings over the defaults, in turn")
+    parser.add_argument(
+        "--peers", action="store_true", help="the fit by PyPose and by Theseus; needs the extra `peers`"
+    )
     parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="this version over another one, in turn")
     parser.add_argument("--data", type=Path, metavar="ROOT", help="default: DIRECTSHAPE_DATA")
     parser.add_argument("--quick", action="store_true", help="see that everything runs; no figures to quote")

@@ -1,4 +1,4 @@
-"""This module measures comparable wall-clock times: warmed up, interleaved, medians with quartiles.
+"""This module measures comparable times: warmed up, interleaved, medians with quartiles.
 
 Machines slow down and speed up during a benchmark, so calls that are compared are made in turn.
 """
@@ -56,7 +56,10 @@ class Row:
 
 
 def time_interleaved(
-    sides: Mapping[str, Callable[[], object]], rounds: int, device: torch.device | None = None
+    sides: Mapping[str, Callable[[], object]],
+    rounds: int,
+    device: torch.device | None = None,
+    of_processor: bool = False,
 ) -> dict[str, float]:
     """Call several functions in turn, round after round; return the median seconds of each, without a first call.
 
@@ -64,22 +67,24 @@ def time_interleaved(
         sides: functions by name, called in reversed order in every second round.
         rounds: number of measured calls, at least one.
         device: device to wait for before the clock is read; None or a CPU needs no waiting.
+        of_processor: whether the time of the processor in this process counts, not that on the wall.
     """
+    clock = time.process_time if of_processor else time.perf_counter
     for call in sides.values():
         call()
     seconds: dict[str, list[float]] = {name: [] for name in sides}
     for number in range(rounds):
         for name in list(sides) if number % 2 == 0 else list(sides)[::-1]:
-            seconds[name].append(_seconds_of(sides[name], device))
+            seconds[name].append(_seconds_of(sides[name], device, clock))
     return {name: statistics.median(values) for name, values in seconds.items()}
 
 
-def _seconds_of(call: Callable[[], object], device: torch.device | None) -> float:
+def _seconds_of(call: Callable[[], object], device: torch.device | None, clock: Callable[[], float]) -> float:
     _wait_for(device)
-    start = time.perf_counter()
+    start = clock()
     call()
     _wait_for(device)
-    return time.perf_counter() - start
+    return clock() - start
 
 
 def _wait_for(device: torch.device | None) -> None:

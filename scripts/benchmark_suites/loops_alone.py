@@ -1,0 +1,76 @@
+"""This module measures the native loops of whole calls alone, on the arguments that the calls gave them.
+
+Their time is a bound of our own: a call would take it if nothing but its loops ran.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from statistics import median
+from typing import Any, TypeAlias
+
+import torch
+
+from benchmark_suites.timing import Row, Spread, time_interleaved
+from directshape_torch import Detections, DirectShapeRefiner, FrameBatch
+from directshape_torch.errors import MissingDependencyError
+
+_LOOPS = "march", "silhouettes", "photometric"
+_Record: TypeAlias = list[tuple[Callable[..., None], tuple[Any, ...]]]
+
+
+def loops_row(name: str, calls: Sequence[tuple[FrameBatch, Detections]], rounds: int) -> Row:
+    """Milliseconds of the native loops of whole calls, repeated with their arguments: a call that does nothing else.
+
+    Raises:
+        MissingDependencyError: Numba is not installed.
+    """
+    refiner, seconds, counts = DirectShapeRefiner(), [], []
+    for call in calls:
+        refine = partial(refiner, *call)
+        with torch.no_grad():
+            refine()  # The first use of the loops looks at their compiled code.
+            with recorded_loops() as record:
+                refine()
+            sides = {"call": refine, "loops": partial(_repeat, record)}
+            seconds.append(time_interleaved(sides, rounds, of_processor=True))
+        counts.append(Counter(loop.__name__ for loop, _ in record))
+    whole, share = (median(1e3 * s["call"] for s in seconds), median(s["loops"] / s["call"] for s in seconds))
+    each = ", ".join(f"{median(count[loop] for count in counts):g} of {loop}" for loop in _LOOPS)
+    note = f"{share:.2g} of the {whole:.4g} ms of a call; {each}"
+    return Row(f"{name}, loops alone: ms", Spread.of([1e3 * s["loops"] for s in seconds]), note)
+
+
+@contextmanager
+def recorded_loops() -> Iterator[_Record]:
+    """A region whose native loops are recorded with their arguments, in order."""
+    try:
+        from directshape_torch.kernels import march, photometric, silhouettes
+    except ImportError as error:
+        raise MissingDependencyError("numba", "fast", "the time of native loops alone") from error
+    record: _Record = []
+
+    def recording(loop: Callable[..., None]) -> Callable[..., None]:
+        def call(*arguments: Any) -> None:
+            record.append((loop, arguments))
+            loop(*arguments)
+
+        return call
+
+    modules = dict(zip(_LOOPS, (march, silhouettes, photometric), strict=True))
+    loops = {name: getattr(module, name) for name, module in modules.items()}
+    for name, module in modules.items():
+        setattr(module, name, recording(loops[name]))
+    try:
+        yield record
+    finally:
+        for name, module in modules.items():
+            setattr(module, name, loops[name])
+
+
+def _repeat(record: _Record) -> None:
+    for loop, arguments in record:
+        loop(*arguments)
