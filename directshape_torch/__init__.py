@@ -1,6 +1,8 @@
 """Joint 3D pose and shape refinement of cars from stereo images (DirectShape), in PyTorch."""
 
 from directshape_torch.batch.fit_shape import ShapeFit, fit_shape
+from directshape_torch.check.check_scene import check_scene
+from directshape_torch.check.finding import CheckReport, Finding
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import (
     ConfigError,
@@ -24,8 +26,6 @@ from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.scene.detections import Detections, Occluders
 from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.scene.masks import MaskCrops
-from directshape_torch.scene_check.check_scene import check_scene
-from directshape_torch.scene_check.finding import CheckReport, Finding
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.status import Status

@@ -169,7 +169,7 @@ class DirectShapeRefiner(nn.Module):
         if not is_due or not len(detections) or not is_plain(torch.empty(1)):
             return
         # The import stands here, because only a process that asks for the check needs it, mostly once.
-        from directshape_torch.scene_check.check_scene import check_scene
+        from directshape_torch.check.check_scene import check_scene
 
         self._has_checked = True
         for finding in check_scene(frames, detections, match_images=False).findings:

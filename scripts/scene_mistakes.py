@@ -19,11 +19,11 @@ import torch
 from torch import Tensor
 
 from directshape_torch import Detections, FrameBatch, check_scene
+from directshape_torch.check.finding import CheckReport
 from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.scene.masks import MaskCrops
-from directshape_torch.scene_check.finding import CheckReport
 
 Scene = tuple[FrameBatch, Detections]
 

@@ -12,12 +12,12 @@ import argparse
 import json
 from pathlib import Path
 
+from directshape_torch.check.check_dataset import check_dataset, report_content
+from directshape_torch.check.finding import CheckReport, unreadable
 from directshape_torch.cli.options import add_data_options, add_lidar_option, dataset_of
 from directshape_torch.cli.progress import Bar
-from directshape_torch.data_check.check_dataset import check_dataset, report_content
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_json
-from directshape_torch.scene_check.finding import CheckReport, unreadable
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -20,6 +20,8 @@ from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.batch.ray_engine import check_cluster
 from directshape_torch.batch.refine_dataset import check_out_dir, refine_dataset
 from directshape_torch.batch.run_summary import format_summary
+from directshape_torch.check.check_dataset import check_frames
+from directshape_torch.check.finding import SAID_BY_THE_RUN, by_severity
 from directshape_torch.cli.options import (
     add_data_options,
     add_device_option,
@@ -29,7 +31,6 @@ from directshape_torch.cli.options import (
     make_refiner,
 )
 from directshape_torch.cli.progress import Bar, ProgressBar
-from directshape_torch.data_check.check_dataset import check_frames
 from directshape_torch.errors import InputError
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.io.config_files import load_config
@@ -40,7 +41,6 @@ from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.from_files import estimate_rigs
 from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, known_rigs, load_rigs, save_rigs
 from directshape_torch.rig.rigs import RigEstimates
-from directshape_torch.scene_check.finding import SAID_BY_THE_RUN, by_severity
 from directshape_torch.terms.lidar import LidarPoints
 from directshape_torch.visualize.overlay import overlay_of_frame
 from directshape_torch.visualize.rig_picture import draw_rigs

@@ -8,11 +8,11 @@ from dataclasses import fields
 from pathlib import Path
 from typing import get_args
 
+from directshape_torch.check.conventions import all_conventions
+from directshape_torch.check.finding import MISTAKES
 from directshape_torch.geometry.box_formats import box_form
 from directshape_torch.io import folder_files
 from directshape_torch.io.stereo_dataset import LayoutName
-from directshape_torch.scene_check.conventions import all_conventions
-from directshape_torch.scene_check.finding import MISTAKES
 
 ROOT = Path(__file__).parents[2]
 INPUTS = (ROOT / "docs" / "inputs.md").read_text(encoding="utf-8")
@@ -46,7 +46,7 @@ def test_the_smallest_frame_is_one(tmp_path: Path) -> None:
 
 
 def test_every_finding_is_in_the_table() -> None:
-    sources = [path.read_text() for path in (ROOT / "directshape_torch" / "data_check").glob("*.py")]
+    sources = [path.read_text() for path in (ROOT / "directshape_torch" / "check").glob("*.py")]
     sources.append((ROOT / "directshape_torch" / "cli" / "check_data.py").read_text())
     text = "\n".join(sources)
     named = set(re.findall(r'(?:Finding|unreadable|attempt)\(\s*"([a-z0-9_]{2,})"', text))

@@ -18,8 +18,8 @@ import torch
 from helpers.layouts import put
 
 import directshape_torch
+from directshape_torch.check.check_dataset import check_dataset
 from directshape_torch.cli.main import main
-from directshape_torch.data_check.check_dataset import check_dataset
 from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.io.kitti_labels import poses_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from directshape_torch.scene_check import check_images, check_lidar
+from directshape_torch.check import check_images, check_lidar
 
 
 def _remembered(match: Callable[..., Any]) -> Callable[..., Any]:

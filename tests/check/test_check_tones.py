@@ -12,8 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 import directshape_torch
+from directshape_torch.check.check_tones import check_tones
 from directshape_torch.io.image_files import read_pair
-from directshape_torch.scene_check.check_tones import check_tones
 
 Image = NDArray[np.uint8]
 TRAINING = Path(directshape_torch.__file__).parent / "assets" / "demo" / "training"

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 import directshape_torch
 from directshape_torch import check_scene
+from directshape_torch.check.check_dataset import check_dataset
+from directshape_torch.check.finding import CheckReport
 from directshape_torch.cli.main import main
-from directshape_torch.data_check.check_dataset import check_dataset
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.image_files import read_pair
 from directshape_torch.io.stereo_dataset import StereoDataset, open_dataset
 from directshape_torch.io.velodyne import read_points
-from directshape_torch.scene_check.finding import CheckReport
 from directshape_torch.stereo_matching.disparity import match_disparity
 
 DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"

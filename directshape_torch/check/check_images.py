@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from directshape_torch.check.car_evidence import Pair
+from directshape_torch.check.check_places import swapped
+from directshape_torch.check.check_tones import check_tones
+from directshape_torch.check.finding import Finding, Severity, found
+from directshape_torch.check.words import Words
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.scene_check.car_evidence import Pair
-from directshape_torch.scene_check.check_places import swapped
-from directshape_torch.scene_check.check_tones import check_tones
-from directshape_torch.scene_check.finding import Finding, Severity, found
-from directshape_torch.scene_check.words import Words
 
 # If one of these is wrong, disparities and projections are not informative.
 SPOILS_CAMERA = frozenset({"raw_intrinsics", "baseline_sign", "baseline_length", "focal_length", "principal_point"})

@@ -17,11 +17,11 @@ import pytest
 from helpers.matched_once import matched_once
 
 import directshape_torch
+from directshape_torch.check.check_dataset import check_dataset
+from directshape_torch.check.finding import CheckReport
 from directshape_torch.cli.main import main
-from directshape_torch.data_check.check_dataset import check_dataset
 from directshape_torch.io.instance_masks import decode_segmentation
 from directshape_torch.io.stereo_dataset import open_dataset
-from directshape_torch.scene_check.finding import CheckReport
 
 DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 Break = Callable[[Path], object]  # changes the files below a root with `training` and `detections`

@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from directshape_torch.check.car_evidence import Floats, FrameEvidence
+from directshape_torch.check.conventions import projected_boxes
+from directshape_torch.check.finding import Finding, Severity, found, of_cars
+from directshape_torch.check.words import Words
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.geometry.stereo_depth import depth_from_disparity
-from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence
-from directshape_torch.scene_check.conventions import projected_boxes
-from directshape_torch.scene_check.finding import Finding, Severity, found, of_cars
-from directshape_torch.scene_check.words import Words
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.zero_level import sdf_to_mesh
 

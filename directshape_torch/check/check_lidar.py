@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from directshape_torch.check.car_evidence import T_CAMERA_LIDAR, Floats, FrameEvidence, Pair, Scan
+from directshape_torch.check.finding import Finding, Severity, found
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.scene_check.car_evidence import T_CAMERA_LIDAR, Floats, FrameEvidence, Pair, Scan
-from directshape_torch.scene_check.finding import Finding, Severity, found
 from directshape_torch.stereo_matching.disparity import match_disparity
 
 # This is the share of the points above the road with the disparity of the images. Correct scans reach 0.73 or more,

@@ -16,20 +16,20 @@ from helpers.layouts import write_folder
 from numpy.typing import NDArray
 
 import directshape_torch
+from directshape_torch.check import check_dataset as module
+from directshape_torch.check.check_dataset import check_dataset
+from directshape_torch.check.check_frame import numbers_of
+from directshape_torch.check.check_images import PairMatches, check_calibration, check_pair
+from directshape_torch.check.check_places import check_distances
+from directshape_torch.check.finding import MISTAKES, CheckReport, Finding, by_severity, found, unreadable
+from directshape_torch.check.words import KITTI_FILES, words_of_files, words_of_tensors
 from directshape_torch.cli.main import main
-from directshape_torch.data_check import check_dataset as module
-from directshape_torch.data_check.check_dataset import check_dataset
-from directshape_torch.data_check.check_frame import numbers_of
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.box_formats import BoxFormat
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_calibration import KittiCalibration
 from directshape_torch.io.stereo_dataset import LayoutName, open_dataset
-from directshape_torch.scene_check.check_images import PairMatches, check_calibration, check_pair
-from directshape_torch.scene_check.check_places import check_distances
-from directshape_torch.scene_check.finding import MISTAKES, CheckReport, Finding, by_severity, found, unreadable
-from directshape_torch.scene_check.words import KITTI_FILES, words_of_files, words_of_tensors
 
 SIZE_HW = (400, 1200)
 K = np.array([[700.0, 0, 600], [0, 700, 200], [0, 0, 1]])

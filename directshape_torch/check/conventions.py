@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from directshape_torch.check.car_evidence import CarBoxes, FrameEvidence
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.box_formats import BoxForm
 from directshape_torch.geometry.image_boxes import box_iou, project_boxes
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence
 
 Points = NDArray[np.float64]  # (N, 3)
 Angles = NDArray[np.float64]  # (N,)

@@ -6,17 +6,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from directshape_torch.geometry.image_boxes import box_iou
-from directshape_torch.scene_check.car_evidence import FrameEvidence
-from directshape_torch.scene_check.check_masks import check_placement
-from directshape_torch.scene_check.conventions import (
+from directshape_torch.check.car_evidence import FrameEvidence
+from directshape_torch.check.check_masks import check_placement
+from directshape_torch.check.conventions import (
     ConventionScores,
     projected_boxes,
     score_conventions,
     spoken,
 )
-from directshape_torch.scene_check.finding import Finding, found, of_cars
-from directshape_torch.scene_check.words import Words
+from directshape_torch.check.finding import Finding, found, of_cars
+from directshape_torch.check.words import Words
+from directshape_torch.geometry.image_boxes import box_iou
 
 # Another convention must gain this mean IoU before boxes are taken to be written in it: with observation angles, and
 # without them for many and for few cars. Correct data sets gain nothing, single frames of two to six cars up to 0.05.

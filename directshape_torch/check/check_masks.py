@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from directshape_torch.check.car_evidence import Floats, FrameEvidence
+from directshape_torch.check.conventions import projected_boxes
+from directshape_torch.check.finding import Finding, Severity, found, of_cars
 from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.scene.frames import SIDES, Side
-from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence
-from directshape_torch.scene_check.conventions import projected_boxes
-from directshape_torch.scene_check.finding import Finding, Severity, found, of_cars
 
 # This is the mean IoU of masks and 2D boxes, over the possible number of pairs.
 OVERLAP_ERROR, OVERLAP_WARNING = 0.3, 0.37

@@ -11,13 +11,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from directshape_torch.check.words import Words, words_of_tensors
 from directshape_torch.geometry.box3d import rotation_y_from_pose
 from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import SIDES, FrameBatch, Side
 from directshape_torch.scene.masks import MASK_THRESHOLD
-from directshape_torch.scene_check.words import Words, words_of_tensors
 from directshape_torch.stereo_matching.disparity import rgb8
 
 Floats = NDArray[np.float64]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.scene_check.finding import Finding, Severity, found
+from directshape_torch.check.finding import Finding, Severity, found
 
 # For 72 real and rendered pairs the 99th percentile is at least 219, the quantiles of the sides differ by at most 15,
 # at most 16 % are saturated, and the rows of the two sides correlate by at least 0.94.

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import directshape_torch
+from directshape_torch.check.check_images import with_images
+from directshape_torch.check.finding import found
 from directshape_torch.io.image_files import read_pair
-from directshape_torch.scene_check.check_images import with_images
-from directshape_torch.scene_check.finding import found
 
 TRAINING = Path(directshape_torch.__file__).parent / "assets" / "demo" / "training"
 

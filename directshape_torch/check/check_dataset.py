@@ -8,16 +8,16 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.data_check.check_frame import check_frame
+from directshape_torch.check.car_evidence import FrameEvidence
+from directshape_torch.check.check_frame import check_frame
+from directshape_torch.check.check_scene import check_cars
+from directshape_torch.check.finding import CheckReport, Finding, by_severity, found
+from directshape_torch.check.words import words_of_files
 from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.rig import Rig
 from directshape_torch.rig.rigs import rig_among
-from directshape_torch.scene_check.car_evidence import FrameEvidence
-from directshape_torch.scene_check.check_scene import check_cars
-from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, found
-from directshape_torch.scene_check.words import words_of_files
 
 DEFAULT_MAX_FRAMES = 20
 REPORT_SCHEMA_VERSION = 1

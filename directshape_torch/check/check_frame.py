@@ -12,6 +12,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from directshape_torch.check.car_evidence import CarBoxes, FrameEvidence, Pair, Scan, reread_boxes
+from directshape_torch.check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, with_images
+from directshape_torch.check.finding import Finding, found, names, unreadable
+from directshape_torch.check.words import Words, words_of_files
 from directshape_torch.errors import DataFormatError, DirectShapeError
 from directshape_torch.geometry.image_boxes import box_iou, project_boxes
 from directshape_torch.geometry.stereo_camera import StereoCamera
@@ -25,10 +29,6 @@ from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.io.velodyne import lidar_pose, points_by_columns, read_points
 from directshape_torch.scene.detections import MOST_TELLING
 from directshape_torch.scene.frames import SIDES
-from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence, Pair, Scan, reread_boxes
-from directshape_torch.scene_check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, with_images
-from directshape_torch.scene_check.finding import Finding, found, names, unreadable
-from directshape_torch.scene_check.words import Words, words_of_files
 
 _Part = TypeVar("_Part")
 _SOME_MASKS = 3

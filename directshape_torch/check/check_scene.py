@@ -7,18 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 
+from directshape_torch.check.car_evidence import FrameEvidence, evidence_of_scene
+from directshape_torch.check.check_boxes import check_box_2d, check_boxes, check_corners
+from directshape_torch.check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, with_images
+from directshape_torch.check.check_lidar import check_lidar
+from directshape_torch.check.check_masks import check_masks
+from directshape_torch.check.check_places import check_distances, check_heading, check_swapped, measure_cars
+from directshape_torch.check.finding import CheckReport, Finding, by_severity, names
+from directshape_torch.check.finding import found as found_mistake
+from directshape_torch.check.words import Words
 from directshape_torch.numerics.checks import check_type
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
-from directshape_torch.scene_check.car_evidence import FrameEvidence, evidence_of_scene
-from directshape_torch.scene_check.check_boxes import check_box_2d, check_boxes, check_corners
-from directshape_torch.scene_check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, with_images
-from directshape_torch.scene_check.check_lidar import check_lidar
-from directshape_torch.scene_check.check_masks import check_masks
-from directshape_torch.scene_check.check_places import check_distances, check_heading, check_swapped, measure_cars
-from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, names
-from directshape_torch.scene_check.finding import found as found_mistake
-from directshape_torch.scene_check.words import Words
 
 
 def check_scene(

@@ -1,1 +1,0 @@
-"""This package checks a stereo data set on disk: its files, and the scenes in them."""
