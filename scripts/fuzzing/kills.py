@@ -69,9 +69,9 @@ def _started(runs: DisturbedRuns) -> subprocess.Popen[bytes]:
 
 
 def _children(pid: int) -> list[int]:
-    """The workers of a run, which are its children that import the package."""
-    with suppress(FileNotFoundError):
-        found = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    """The workers of a run, which are its children that import the package; any thread may have started them."""
+    with suppress(FileNotFoundError, ProcessLookupError):
+        found = [each for some in Path(f"/proc/{pid}/task").glob("*/children") for each in some.read_text().split()]
         return [int(each) for each in found if b"spawn_main" in Path(f"/proc/{each}/cmdline").read_bytes()]
     return []
 

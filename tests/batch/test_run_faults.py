@@ -78,7 +78,9 @@ def stopped_in_the_middle(root: Path, out: Path, by: signal.Signals) -> None:
 
 
 def children(pid: int) -> list[int]:
-    return [int(each) for each in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    """The child processes, each of which belongs to the thread that started it."""
+    lists = Path(f"/proc/{pid}/task").glob("*/children")
+    return [int(each) for some in lists for each in some.read_text().split()]
 
 
 def is_running(pid: int) -> bool:
