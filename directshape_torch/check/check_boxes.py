@@ -1,21 +1,31 @@
-"""This module checks whether boxes follow their convention: axes, origin, heading, order, units; corners in 2D."""
+"""This module checks whether boxes follow their convention: axes, origin, heading, order, units; corners in 2D.
+
+Its hypotheses are the conventions of other tools, and the score is the overlap of projected boxes with 2D boxes and
+masks.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
-from directshape_torch.check.car_evidence import FrameEvidence
+from directshape_torch.check.car_evidence import Floats, FrameEvidence
 from directshape_torch.check.check_masks import check_placement
 from directshape_torch.check.conventions import (
-    ConventionScores,
+    ORDERS,
+    YAWS,
+    BoxConvention,
+    all_conventions,
+    project_conventions,
     projected_boxes,
-    score_conventions,
     spoken,
 )
-from directshape_torch.check.finding import Finding, found, of_cars
-from directshape_torch.check.words import Words
+from directshape_torch.check.finding import Finding
+from directshape_torch.check.hypotheses import accepted
+from directshape_torch.check.mistakes import Words, found, of_cars
 from directshape_torch.geometry.image_boxes import box_iou
 
 # Another convention must gain this mean IoU before boxes are taken to be written in it: with observation angles, and
@@ -29,6 +39,15 @@ MIN_OVERLAP = 0.45
 LENGTHS_M = (2.3, 9.0)
 MIN_CARS_FOR_SHAPE = 4
 MAX_HEIGHT_TO_WIDTH = 1.03
+# The documented convention is preferred to one that explains the image only a little better.
+_PENALTY_PER_DEVIATION = 0.02
+# Cars are longer than they are wide or high. A turned box and a swapped pair of lengths have the same projection.
+_PENALTY_SHORT_CARS = 0.2
+# From this mean IoU on, 2D boxes are taken for projections of the 3D ones.
+_SAME_BOX = 0.95
+# This is added to the score if all observation angles agree with heading and position.
+_ANGLE_WEIGHT, _ANGLE_TOLERANCE_RAD = 0.15, 0.06
+# Larger angles are KITTI's number for unknown angles, or are not in radians.
 _ONE_TURN = 2 * np.pi + 0.01
 
 # These are the parts of a convention that are factors: the check, the multiplied quantity, the expectation, the cure.
@@ -45,42 +64,51 @@ _FACTORS = {
 }
 
 
+class _Scores(NamedTuple):
+    """A `_Scores` says how well boxes explain the image, for C conventions."""
+
+    conventions: tuple[BoxConvention, ...]  # the documented one first
+    overlap: Floats  # (C, N) IoU of N projected boxes with the image's boxes
+    score: Floats  # (C,) mean IoU less a penalty for deviations
+    # (C,) share of the cars whose observation angle `alpha` agrees with heading and position; None if alpha is
+    # unusable.
+    angle_share: Floats | None
+
+
 def check_boxes(frames: Sequence[FrameEvidence]) -> list[Finding]:
-    """What the boxes of all frames show together; the result is empty without cars."""
-    frames = [frame for frame in frames if len(frame.boxes)]
-    if not frames:
-        return []
+    """What the boxes of all frames, which have at least one car, show together."""
     of_numbers, words = _check_lengths(frames) + _check_turns(frames), frames[0].words
-    scores = score_conventions(frames)
+    scores = _score_conventions(frames)
     best = _better_convention(scores)
-    overlap = float(scores.overlap[0 if best is None else best].mean())
+    overlap = float(scores.overlap[best or 0].mean())
     if best is not None or overlap < MIN_OVERLAP:
         of_masks = check_placement(frames, overlap)
         if of_masks:
             return of_masks
     if best is not None:
-        of_numbers = [finding for finding in of_numbers if finding.check == "box_units"]
-        return of_numbers + _deviations(scores, best, words)
-    if overlap < MIN_OVERLAP and not of_numbers:
-        return [_unexplained(overlap, scores, words)]
-    return of_numbers
+        return [finding for finding in of_numbers if finding.check == "box_units"] + _deviations(scores, best, words)
+    if overlap >= MIN_OVERLAP or of_numbers:
+        return of_numbers
+    measured = (
+        f"projected boxes overlap 2D boxes and masks by {overlap:.2f} in the mean, and no known convention does better"
+    )
+    return [found("box_projection", of_cars(scores.overlap.shape[1]), measured, words, limit=MIN_OVERLAP)]
 
 
-def _better_convention(scores: ConventionScores) -> int | None:
+def _better_convention(scores: _Scores) -> int | None:
     """The convention that explains image and angles clearly better than the documented one, or None."""
-    image_gain = MIN_GAIN_IMAGE if scores.overlap.shape[1] >= MANY_CARS else MIN_GAIN_OF_FEW
-    by_angles = [] if scores.angle_share is None else [(scores.score_with_angles, MIN_GAIN)]
-    for score, gain in (*by_angles, (scores.score, image_gain)):
-        # Among conventions that explain about the same, the simplest is taken.
-        close = np.flatnonzero(score > score.max() - TIE)
-        best = int(min(close, key=lambda row: (len(scores.conventions[row].deviations), -score[row])))
-        explains = scores.overlap[best].mean() > MIN_OVERLAP
-        if best and explains and score[best] - score[0] > gain:
+    hypotheses = [(scores.score, MIN_GAIN_IMAGE if scores.overlap.shape[1] >= MANY_CARS else MIN_GAIN_OF_FEW)]
+    if scores.angle_share is not None:
+        hypotheses.insert(0, (scores.score + _ANGLE_WEIGHT * scores.angle_share, MIN_GAIN))
+    deviations = [len(convention.deviations) for convention in scores.conventions]
+    for score, gain in hypotheses:
+        best = accepted(score, gain, deviations=deviations, tie=TIE)
+        if best is not None and scores.overlap[best].mean() > MIN_OVERLAP:
             return best
     return None
 
 
-def _deviations(scores: ConventionScores, best: int, words: Words) -> list[Finding]:
+def _deviations(scores: _Scores, best: int, words: Words) -> list[Finding]:
     before, after = scores.overlap[0].mean(), scores.overlap[best].mean()
     findings = []
     for part, value in scores.conventions[best].deviations.items():
@@ -93,15 +121,71 @@ def _deviations(scores: ConventionScores, best: int, words: Words) -> list[Findi
         if share is not None and share[best] > share[0]:
             measured += f", alpha agrees in {share[best]:.0%} instead of {share[0]:.0%}"
         where = of_cars(scores.overlap.shape[1])
-        findings.append(found(check, where, measured, words=words, expected=expected, cure=cure))
+        findings.append(found(check, where, measured, words, expected=expected, cure=cure))
     return findings
 
 
-def _unexplained(overlap: float, scores: ConventionScores, words: Words) -> Finding:
-    measured = (
-        f"projected boxes overlap 2D boxes and masks by {overlap:.2f} in the mean, and no known convention does better"
-    )
-    return found("box_projection", of_cars(scores.overlap.shape[1]), measured, words=words, limit=MIN_OVERLAP)
+def _score_conventions(frames: Sequence[FrameEvidence]) -> _Scores:
+    """The scores over the cars of all frames.
+
+    Projected boxes are compared with the 2D box of the detection and with the masks, and the best IoU counts. If the 2D
+    boxes are projections of the 3D ones, only masks are used, and only as many cars as there are masks.
+    """
+    conventions = all_conventions(frames[0].words.form)
+    projections = _boxes_are_projections(frames)
+    overlap = np.concatenate([_overlaps(frame, conventions, projections) for frame in frames], axis=1)
+    median_hwl = np.median(np.concatenate([frame.boxes.hwl for frame in frames]), axis=0)
+    penalty = np.array([_penalty(convention, median_hwl) for convention in conventions])
+    alpha, angle_share = np.concatenate([frame.boxes.alpha for frame in frames]), None
+    if (np.abs(alpha) <= _ONE_TURN).all() and (len(alpha) == 1 or np.ptp(alpha) > 0):  # false for NaN
+        # Origin and order do not change an angle seen from above.
+        share = {
+            (axes, yaw): _angles_agree(BoxConvention(axes, yaw=yaw), frames)
+            for axes, yaw in product({each.axes for each in conventions}, YAWS)
+        }
+        angle_share = np.array([share[convention.axes, convention.yaw] for convention in conventions])
+    return _Scores(conventions, overlap, overlap.mean(axis=1) - penalty, angle_share)
+
+
+def _angles_agree(convention: BoxConvention, frames: Sequence[FrameEvidence]) -> float:
+    """Share of the cars with `alpha = rotation_y - atan2(x, z)` within the tolerance."""
+    agree = []
+    for boxes in (convention.to_kitti(frame.boxes, frame.words.form) for frame in frames):
+        expected = boxes.rotation_y - np.arctan2(boxes.location[:, 0], boxes.location[:, 2])
+        difference = np.angle(np.exp(1j * (boxes.alpha - expected)))
+        agree.append(np.abs(difference) < _ANGLE_TOLERANCE_RAD)
+    return float(np.concatenate(agree).mean())
+
+
+def _penalty(convention: BoxConvention, median_hwl: Floats) -> float:
+    height, width, length = median_hwl[list(ORDERS[convention.order])]
+    short = length < max(height, width)
+    return _PENALTY_PER_DEVIATION * len(convention.deviations) + _PENALTY_SHORT_CARS * bool(short)
+
+
+def _overlaps(frame: FrameEvidence, conventions: Sequence[BoxConvention], boxes_are_projections: bool) -> Floats:
+    """IoU (C, N) of each car, or of the best cars of each convention if there are fewer masks."""
+    projected = project_conventions(frame, conventions)
+    overlaps = np.zeros(projected.shape[:2])
+    for car in range(len(frame.boxes)):
+        own = frame.seen[car]
+        own = own if boxes_are_projections else np.concatenate([own, frame.boxes.box_2d[car : car + 1]])
+        if len(own):
+            overlaps[:, car] = box_iou(projected[:, car], own).max(axis=1)
+    if not boxes_are_projections:
+        return overlaps
+    return -np.sort(-overlaps, axis=1)[:, : min(len(frame.boxes), frame.num_masks["left"])]
+
+
+def _boxes_are_projections(frames: Sequence[FrameEvidence]) -> bool:
+    """Whether the 2D boxes are projections of the 3D ones, read as documented, and so contain no evidence.
+
+    Without masks the 2D boxes are used in any case.
+    """
+    if not any(frame.num_masks["left"] for frame in frames):
+        return False
+    overlaps = [box_iou(projected_boxes(frame), frame.boxes.box_2d).diagonal() for frame in frames]
+    return bool(np.mean(np.concatenate(overlaps)) > _SAME_BOX)
 
 
 def _check_lengths(frames: Sequence[FrameEvidence]) -> list[Finding]:
@@ -110,29 +194,13 @@ def _check_lengths(frames: Sequence[FrameEvidence]) -> list[Finding]:
     longest = float(np.median(hwl.max(axis=1)))
     where, (low, high), words = of_cars(len(hwl)), LENGTHS_M, frames[0].words
     if not low < longest < high:
-        return [
-            found(
-                "box_units",
-                where,
-                f"the longest side of a box is {longest:.3g} in the median",
-                words=words,
-                low=low,
-                high=high,
-            )
-        ]
-    if len(hwl) >= MIN_CARS_FOR_SHAPE and height > MAX_HEIGHT_TO_WIDTH * width:
-        measured = f"boxes are {height:.2f} m high and {width:.2f} m wide in the median"
-        return [
-            found(
-                "box_order",
-                where,
-                measured,
-                words=words,
-                severity="warning",
-                expected=f"cars that are wider than high; sizes are {words.form.order}",
-            )
-        ]
-    return []
+        measured = f"the longest side of a box is {longest:.3g} in the median"
+        return [found("box_units", where, measured, words, low=low, high=high)]
+    if len(hwl) < MIN_CARS_FOR_SHAPE or height <= MAX_HEIGHT_TO_WIDTH * width:
+        return []
+    measured = f"boxes are {height:.2f} m high and {width:.2f} m wide in the median"
+    expected = f"cars that are wider than high; sizes are {words.form.order}"
+    return [found("box_order", where, measured, words, severity="warning", expected=expected)]
 
 
 def _check_turns(frames: Sequence[FrameEvidence]) -> list[Finding]:
@@ -141,18 +209,16 @@ def _check_turns(frames: Sequence[FrameEvidence]) -> list[Finding]:
         return []
     words = frames[0].words
     measured = f"{words.form.heading.split()[0]} reaches {np.abs(yaw).max():.1f}"
-    return [found("box_yaw", of_cars(len(yaw)), measured, words=words)]
+    return [found("box_yaw", of_cars(len(yaw)), measured, words)]
 
 
 def check_box_2d(frames: Sequence[FrameEvidence]) -> list[Finding]:
     """Whether `x y width height` fits the projected 3D boxes better than `u_min v_min u_max v_max`."""
-    if not frames:
-        return []
     seen = np.concatenate([frame.boxes.box_2d for frame in frames])
     boxes = np.concatenate([projected_boxes(frame) for frame in frames])
     sized = np.concatenate([seen[:, :2], seen[:, :2] + seen[:, 2:]], axis=1)
     as_corners, as_size = (float(box_iou(boxes, way).diagonal().mean()) for way in (seen, sized))
-    if as_size <= as_corners + MIN_GAIN_2D:
+    if accepted((as_corners, as_size), MIN_GAIN_2D) is None:
         return []
     measured = (
         f"projected 3D boxes overlap 2D boxes by {as_corners:.2f}, "
@@ -163,7 +229,7 @@ def check_box_2d(frames: Sequence[FrameEvidence]) -> list[Finding]:
 
 def check_corners(frames: Sequence[FrameEvidence]) -> list[Finding]:
     """Whether 2D boxes end after they begin; missing 2D boxes are checked with the files."""
-    boxes = np.concatenate([np.empty((0, 4)), *(frame.boxes.box_2d for frame in frames)])
+    boxes = np.concatenate([frame.boxes.box_2d for frame in frames])
     boxes = boxes[(boxes != 0).any(axis=1)]
     empty = int((boxes[:, 2:] <= boxes[:, :2]).any(axis=1).sum())
     if not empty:

@@ -8,18 +8,16 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.check.car_evidence import FrameEvidence
-from directshape_torch.check.check_frame import check_frame
 from directshape_torch.check.check_scene import check_cars
-from directshape_torch.check.finding import CheckReport, Finding, by_severity, found
-from directshape_torch.check.words import words_of_files
+from directshape_torch.check.finding import CheckReport, Finding, by_severity
+from directshape_torch.check.mistakes import found, words_of_files
+from directshape_torch.check.read_frame import read_frame
 from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.rig import Rig
 from directshape_torch.rig.rigs import rig_among
 
-DEFAULT_MAX_FRAMES = 20
 REPORT_SCHEMA_VERSION = 1
 _NAMED = 3
 # An offset of 0.15 px is 0.35 m at 30 m on KITTI's rig.
@@ -29,9 +27,7 @@ _FEWEST_CARS = 10  # with fewer cars the noise of a detector is not known
 
 
 def check_dataset(
-    dataset: StereoDataset,
-    max_frames: int | None = DEFAULT_MAX_FRAMES,
-    tell: Callable[[str], object] = lambda _: None,
+    dataset: StereoDataset, max_frames: int | None = 20, tell: Callable[[str], object] = lambda _: None
 ) -> CheckReport:
     """Check a data set for common mistakes.
 
@@ -46,9 +42,10 @@ def check_dataset(
     """
     if max_frames is not None and max_frames < 1:
         raise InputError("max_frames", "at least 1", str(max_frames))
-    chosen = spread(dataset.frame_ids, max_frames)
+    number = len(dataset) if max_frames is None else min(max_frames, len(dataset))
+    chosen = [dataset.frame_ids[index * len(dataset) // number] for index in range(number)]
     findings, num_cars = check_frames(dataset, chosen, tell)
-    findings = [*check_files(dataset), *findings]
+    findings = [*_check_files(dataset), *findings]
     # If boxes or images are wrong, the estimate of the rig would only report the same mistake again.
     if not any(finding.severity == "error" for finding in findings):
         findings += check_rig(dataset, chosen)
@@ -68,11 +65,9 @@ def check_frames(
         frame_ids: frames to check.
         match_images: whether features of both images are matched, which takes most of the time.
     """
-    findings: list[Finding] = []
-    evidence: list[FrameEvidence] = []
-    num_cars = 0
+    findings, evidence, num_cars = list[Finding](), [], 0
     for frame_id in frame_ids:
-        of_frame, count, of_its_cars = check_frame(dataset, frame_id, match_images)
+        of_frame, count, of_its_cars = read_frame(dataset, frame_id, match_images)
         findings += of_frame
         evidence += [] if of_its_cars is None else [of_its_cars]
         num_cars += count
@@ -81,25 +76,23 @@ def check_frames(
     nothing = "no detection of the chosen classes with a 3D box"
     if not dataset.has_detections:
         nothing, num_cars = "no mask of a car in the left images", sum(one.num_masks["left"] for one in evidence)
-    of_cars = check_cars(evidence) if num_cars else [found("no_cars", "all frames", nothing, words=words)]
+    of_cars = check_cars(evidence) if num_cars else [found("no_cars", "all frames", nothing, words)]
     return [*findings, *of_cars], num_cars
 
 
-def spread(frame_ids: Sequence[str], count: int | None) -> tuple[str, ...]:
-    """At most `count` of the frames, evenly spread, including the first."""
-    if count is None or count >= len(frame_ids):
-        return tuple(frame_ids)
-    return tuple(frame_ids[index * len(frame_ids) // count] for index in range(count))
-
-
-def check_files(dataset: StereoDataset) -> list[Finding]:
+def _check_files(dataset: StereoDataset) -> list[Finding]:
     """One finding for each kind of missing file in all frames; only the existence of files is checked."""
     missing: dict[str, list[str]] = {}
     for frame_id in dataset.frame_ids:
         for role, path in _files(dataset, frame_id):
             if not path.is_file():
                 missing.setdefault(role, []).append(str(path))
-    return [_missing(role, paths, len(dataset)) for role, paths in missing.items()]
+    findings = []
+    for role, paths in missing.items():
+        more = f" and {len(paths) - _NAMED} more" if len(paths) > _NAMED else ""
+        measured = f"no {role.replace('_', ' ')}: {', '.join(paths[:_NAMED])}{more}"
+        findings.append(found("missing_files", f"{len(paths)} of {len(dataset)} frames", measured))
+    return findings
 
 
 def _files(dataset: StereoDataset, frame_id: str) -> Iterable[tuple[str, Path]]:
@@ -109,12 +102,6 @@ def _files(dataset: StereoDataset, frame_id: str) -> Iterable[tuple[str, Path]]:
         # A file that lists other files is missing or damaged, which is found when the frame is read.
         files = dataset.layout.files(frame_id)
         return [("image_left", files.left), ("image_right", files.right), ("list of masks", error.path)]
-
-
-def _missing(role: str, paths: list[str], num_frames: int) -> Finding:
-    more = f" and {len(paths) - _NAMED} more" if len(paths) > _NAMED else ""
-    measured = f"no {role.replace('_', ' ')}: {', '.join(paths[:_NAMED])}{more}"
-    return found("missing_files", f"{len(paths)} of {num_frames} frames", measured)
 
 
 def report_content(report: CheckReport) -> dict[str, Any]:

@@ -1,18 +1,19 @@
-"""This module checks calibration and images: signs, magnitudes, swapped, mirrored, unrelated or unrectified images."""
+"""This module checks calibration and images: signs, magnitudes, levels, swapped, mirrored, unrelated, unrectified."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from directshape_torch.check.car_evidence import Pair
+from directshape_torch.check.car_evidence import Floats, Image, Mask, Pair
 from directshape_torch.check.check_places import swapped
 from directshape_torch.check.check_tones import check_tones
-from directshape_torch.check.finding import Finding, Severity, found
-from directshape_torch.check.words import Words
+from directshape_torch.check.finding import Finding, Severity, names
+from directshape_torch.check.hypotheses import accepted
+from directshape_torch.check.mistakes import Words, found
 from directshape_torch.geometry.stereo_camera import StereoCamera
 
 # If one of these is wrong, disparities and projections are not informative.
@@ -51,12 +52,36 @@ EPIPOLAR_TOLERANCE_PX = 1.0
 CONFIDENCE = 0.999
 
 
-def check_calibration(
-    cameras: Mapping[str, NDArray[np.float64]],
-    baseline_m: float,
+Numbers = tuple[Mapping[str, Floats], float]  # intrinsics (3, 3) by camera, and the baseline in metres
+
+
+def check_frame(
+    numbers: Numbers | None,
+    camera: StereoCamera | None,
+    pair: Pair | None,
     size_hw: tuple[int, int] | None,
     where: str,
     words: Words,
+    match_images: bool,
+) -> tuple[list[Finding], StereoCamera | None, Pair | None]:
+    """Findings about calibration and images of one frame, and its camera and images as far as they can be used.
+
+    Matches of the images settle doubts about intrinsics.
+    """
+    findings = [] if numbers is None else check_calibration(*numbers, size_hw, where, words)
+    # A wrong calibration must not affect the checks of the images themselves.
+    camera = None if names(findings) & SPOILS_CAMERA else camera
+    if pair is not None:
+        findings += check_tones(*pair, where)
+        of_pair = check_images(*pair, camera, where) if match_images else []
+        if match_images and "few_matches" not in names(of_pair):
+            findings = [one for one in findings if (one.check, one.severity) != ("raw_intrinsics", "warning")]
+        findings += of_pair
+    return findings, camera, None if names(findings) & SPOILS_PAIR else pair
+
+
+def check_calibration(
+    cameras: Mapping[str, Floats], baseline_m: float, size_hw: tuple[int, int] | None, where: str, words: Words
 ) -> list[Finding]:
     """Findings from numbers alone: intrinsics (3, 3) by camera, baseline and image size.
 
@@ -66,17 +91,16 @@ def check_calibration(
     if size_hw is not None:
         findings = [f for name, K in cameras.items() for f in _check_intrinsics(K, size_hw, f"{where}, {name}")]
     findings = findings or _check_alike(cameras, where)
+    (low, high), measured = BASELINES_M, f"baseline {baseline_m:.4g} m"
     if baseline_m <= 0:
         measured = f"baseline {baseline_m:.4f} m: the right camera is not to the right of the left one"
-        return [*findings, found("baseline_sign", where, measured, words=words)]
-    low, high = BASELINES_M
-    if baseline_m < low or baseline_m > high:  # false for NaN
-        measured = f"baseline {baseline_m:.4g} m"
-        findings.append(found("baseline_length", where, measured, words=words, low=low, high=high))
+        findings.append(found("baseline_sign", where, measured, words))
+    elif baseline_m < low or baseline_m > high:  # false for NaN
+        findings.append(found("baseline_length", where, measured, words, low=low, high=high))
     return findings
 
 
-def _check_intrinsics(K: NDArray[np.float64], size_hw: tuple[int, int], where: str) -> list[Finding]:
+def _check_intrinsics(K: Floats, size_hw: tuple[int, int], where: str) -> list[Finding]:
     height, width = size_hw
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     low, high = (share * width for share in FOCAL_SHARES)
@@ -92,7 +116,7 @@ def _check_intrinsics(K: NDArray[np.float64], size_hw: tuple[int, int], where: s
     return findings + _check_centre((cx, cy), (width, height), where)
 
 
-def _check_alike(cameras: Mapping[str, NDArray[np.float64]], where: str) -> list[Finding]:
+def _check_alike(cameras: Mapping[str, Floats], where: str) -> list[Finding]:
     """Whether both images can be rectified to these intrinsics; a warning if they may be cropped differently."""
     left, right = cameras.values()
     scale = max(abs(right[k, k] / left[k, k] - 1) for k in (0, 1))
@@ -117,30 +141,15 @@ def _check_centre(centre: tuple[float, float], size_wh: tuple[int, int], where: 
     return [found("principal_point", where, measured, severity=severity, cure=cure if resized else "")]
 
 
-def with_images(
-    of_numbers: Sequence[Finding], pair: Pair, camera: StereoCamera | None, where: str, match_images: bool
-) -> list[Finding]:
-    """Findings from numbers and those of two images, whose matches settle doubts about intrinsics."""
-    found = [*of_numbers, *check_tones(*pair, where)]
-    if not match_images:
-        return found
-    of_pair = check_images(*pair, camera, where)
-    if "few_matches" not in {finding.check for finding in of_pair}:
-        found = [one for one in found if (one.check, one.severity) != ("raw_intrinsics", "warning")]
-    return [*found, *of_pair]
-
-
-def check_images(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera | None, where: str
-) -> list[Finding]:
-    """Findings from feature matches of two images (H, W, 3); a known camera gives their expected positions."""
+def check_images(left: Image, right: Image, camera: StereoCamera | None, where: str) -> list[Finding]:
+    """Findings from feature matches of two images; a known camera gives their expected positions."""
     matches = match_pair(left, right)
     if len(matches) < FEW_MATCHES:
         mirrored = match_pair(left, np.ascontiguousarray(right[:, ::-1]))
-        if len(mirrored) >= max(MIN_MATCHES, 3 * len(matches)):
+        if accepted((len(matches), len(mirrored)), 2 * len(matches), MIN_MATCHES):
             measured = f"{len(mirrored)} features match the mirrored right image, {len(matches)} the image as it is"
             return [found("image_mirrored", where, measured)]
-    return check_pair(matches, camera, (left.shape[0], left.shape[1]), where)
+    return check_pair(matches, camera, left.shape[:2], where)
 
 
 def check_pair(
@@ -182,13 +191,14 @@ def _raw(matches: PairMatches, camera: StereoCamera, where: str) -> Finding:
     return found("raw_intrinsics", where, measured)
 
 
-def _residuals(matches: PairMatches, camera: StereoCamera | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _residuals(matches: PairMatches, camera: StereoCamera | None) -> tuple[Floats, Floats]:
     """Disparities (N,) for equal intrinsics, and `v_right - v_left` (N,) beyond what the calibration explains.
 
     Both are in pixels of the right image.
     """
     if camera is None:
-        return np.asarray(matches.uv_left[:, 0] - matches.uv_right[:, 0]), matches.vertical
+        across, down = (matches.uv_left - matches.uv_right).T
+        return across, -down
     K_left, K_right, t = camera.K_left[0].numpy(), camera.K_right[0].numpy(), camera.T_right_cam[0, :3, 3].numpy()
     scale = K_right.diagonal()[:2] / K_left.diagonal()[:2]
     # These are the right camera's pixels for points of the left image at infinity.
@@ -199,9 +209,7 @@ def _residuals(matches: PairMatches, camera: StereoCamera | None) -> tuple[NDArr
     return np.asarray(disparity), np.asarray(matches.uv_right[:, 1] - far[:, 1] - lower)
 
 
-def _check_rows(
-    matches: PairMatches, residual: NDArray[np.float64], size_hw: tuple[int, int], where: str
-) -> list[Finding]:
+def _check_rows(matches: PairMatches, residual: Floats, size_hw: tuple[int, int], where: str) -> list[Finding]:
     offset, across, down, scatter = _fit_rows(matches.uv_left, residual, size_hw)
     worst = max(abs(offset), abs(across), abs(down))
     if worst > VERTICAL_WARNING_PX:
@@ -218,8 +226,8 @@ def _check_rows(
 
 
 def _fit_rows(
-    uv_left: NDArray[np.float64],  # (N, 2)
-    residual: NDArray[np.float64],  # (N,)
+    uv_left: Floats,  # (N, 2)
+    residual: Floats,  # (N,)
     size_hw: tuple[int, int],
 ) -> tuple[float, float, float, float]:
     """Median of the row residual, its change over the width and over the height of the image, and the scatter.
@@ -241,21 +249,16 @@ def _fit_rows(
 class PairMatches:
     """A `PairMatches` has points that show the same place in both images."""
 
-    uv_left: NDArray[np.float64]  # (N, 2) pixels
-    uv_right: NDArray[np.float64]
+    uv_left: Floats  # (N, 2) pixels
+    uv_right: Floats
     num_candidates: int  # matches before those without a common epipolar geometry were dropped
     num_features: int = 0  # of the image with fewer features
 
     def __len__(self) -> int:
         return len(self.uv_left)
 
-    @property
-    def vertical(self) -> NDArray[np.float64]:
-        """Row differences (N,) v_right - v_left, pixels."""
-        return np.asarray(self.uv_right[:, 1] - self.uv_left[:, 1])
 
-
-def match_pair(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> PairMatches:
+def match_pair(left: Image, right: Image) -> PairMatches:
     """SIFT features of two images (H, W, 3) matched both ways, filtered by a fundamental matrix (seeded RANSAC)."""
     import cv2
 
@@ -271,7 +274,7 @@ def match_pair(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> PairMatches
     return PairMatches(uv_left[keep], uv_right[keep], len(pairs), min(map(len, points)))
 
 
-def _best(descriptors: NDArray[np.float32], others: NDArray[np.float32]) -> dict[int, int]:
+def _best(descriptors: Any, others: Any) -> dict[int, int]:
     import cv2
 
     nearest = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors, others, k=2)
@@ -280,7 +283,7 @@ def _best(descriptors: NDArray[np.float32], others: NDArray[np.float32]) -> dict
     }
 
 
-def _epipolar_inliers(uv_left: NDArray[np.float64], uv_right: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _epipolar_inliers(uv_left: Floats, uv_right: Floats) -> Mask:
     import cv2
 
     if len(uv_left) < 16:

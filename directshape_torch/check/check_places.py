@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from directshape_torch.check.car_evidence import Floats, FrameEvidence
+from directshape_torch.check.car_evidence import Floats, FrameEvidence, Image, Mask
 from directshape_torch.check.conventions import projected_boxes
-from directshape_torch.check.finding import Finding, Severity, found, of_cars
-from directshape_torch.check.words import Words
+from directshape_torch.check.finding import Finding, Severity
+from directshape_torch.check.hypotheses import accepted
+from directshape_torch.check.mistakes import found, of_cars
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.geometry.stereo_depth import depth_from_disparity
@@ -52,26 +53,28 @@ _WAYS: dict[str, tuple[Callable[[float, float], float], str]] = {
 }
 
 
-def measure_cars(frame: FrameEvidence, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> Floats:
-    """Measurements of both images (H, W, 3) for cars in front of the camera with a tall enough left mask.
+def measure_cars(frame: FrameEvidence) -> Floats:
+    """Measurements of both images, if they can be used, for cars in front of the camera with a tall enough left mask.
 
     Returns:
         (N, 3) disparity in pixels for equal principal points, and two distances divided by the distance of the box: by
         disparity, and by the height of the mask, which needs no baseline.
     """
+    if frame.pair is None:
+        return np.empty((0, 3))
     around, camera = frame.mask_boxes["left"], frame.camera
     shift = float(camera.K_left[0, 0, 2] - camera.K_right[0, 0, 2])
     with np.errstate(invalid="ignore"):
         tall = (around[:, 3] - around[:, 1] >= _MIN_HEIGHT_PX) & (frame.boxes.location[:, 2] > 0)
     rows = []
     for car in np.flatnonzero(tall).tolist():
-        disparity = patch_disparity(left, right, around[car])
+        disparity = _patch_disparity(*frame.pair, around[car])
         if np.isfinite(disparity):
             rows.append((disparity - shift, *_ratios(frame, car, disparity)))
     return np.array(rows, dtype=np.float64).reshape(-1, 3)
 
 
-def patch_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], box: Floats) -> float:
+def _patch_disparity(left: Image, right: Image, box: Floats) -> float:
     """Shift in pixels, left to right image, of the content of a box, positive to the left; NaN if there is no match.
 
     It is the best normalised correlation along the rows, in both directions, since swapped images have negative
@@ -170,30 +173,23 @@ def _cure(scale: float, by_size: float) -> str:
 
 def check_heading(frames: Sequence[FrameEvidence]) -> list[Finding]:
     """Whether the outlines of cars fit better with other headings."""
-    if not frames:
-        return []
-    words = frames[0].words
     gains = np.array([gain for frame in frames for gain in _gains(frame)]).reshape(-1, len(_WAYS) + 2)
-    ways = {}
-    of_side = gains[gains[:, -1] > _MIN_SIDE_VIEW]
+    of_side, best = gains[gains[:, -1] > _MIN_SIDE_VIEW], None
     if len(of_side) >= _FEWEST_CARS:
         mean, error = of_side.mean(axis=0), of_side.std(axis=0, ddof=1) / len(of_side) ** 0.5
-        sure = (mean > _LEAST_GAIN) & (mean > _SURE * error)
-        ways = {way: mean[k] for k, way in enumerate(_WAYS) if sure[k]}
-    if ways:
-        way = max(ways, key=lambda each: ways[each])
-        return [_finding(len(of_side), f"fit the masks better {way}, by {ways[way]:.2f}", _WAYS[way][1], words)]
+        sure = np.where(mean > _SURE * error, mean, 0.0)[: len(_WAYS)]
+        best = accepted([0.0, *sure], _LEAST_GAIN)
     free = float(gains[:, -2].mean()) if len(gains) >= _FEWEST_FREE else 0.0
-    if free < _LEAST_FREE_GAIN:
+    if best is not None:
+        way, (_, cure) = list(_WAYS.items())[best - 1]
+        num_cars, fit = len(of_side), f"better {way}, by {mean[best - 1]:.2f}"
+    elif free >= _LEAST_FREE_GAIN:
+        num_cars, cure = len(gains), "turn degrees into radians, or check the order of headings"
+        fit = f"better with other headings, by {free:.2f}, and no rule says which: degrees look like this"
+    else:
         return []
-    measured = (
-        f"fit the masks better with other headings, by {free:.2f}, and no rule says which: degrees look like this"
-    )
-    return [_finding(len(gains), measured, "turn degrees into radians, or check the order of headings", words)]
-
-
-def _finding(num_cars: int, measured: str, cure: str, words: Words) -> Finding:
-    return found("box_yaw", of_cars(num_cars), f"outlines of cars {measured}", words=words, cure=cure)
+    measured = f"outlines of cars fit the masks {fit}"
+    return [found("box_yaw", of_cars(num_cars), measured, frames[0].words, cure=cure)]
 
 
 def _gains(frame: FrameEvidence) -> list[list[float]]:
@@ -219,7 +215,7 @@ def _gains(frame: FrameEvidence) -> list[list[float]]:
     return gains
 
 
-def _agreement(frame: FrameEvidence, car: int, yaw: float, seen: NDArray[np.bool_], aspect: float) -> float:
+def _agreement(frame: FrameEvidence, car: int, yaw: float, seen: Mask, aspect: float) -> float:
     """IoU of the outline with the mask, both scaled to their boxes, times the ratio of their aspects."""
     outline, own_aspect = _outline(frame, car, yaw)
     overlap = float((seen & outline).sum() / (seen | outline).sum())
@@ -227,7 +223,7 @@ def _agreement(frame: FrameEvidence, car: int, yaw: float, seen: NDArray[np.bool
 
 
 @cache
-def _mean_car() -> tuple[Floats, NDArray[np.int64]]:
+def _mean_car() -> tuple[Floats, Any]:
     """Vertices, scaled to length, height and width 1 with the origin at the bottom centre, and triangles."""
     prior = PCAShapePrior.load_bundled()
     coarse = prior.values(prior.initial_code(1))[0, ::2, ::2, ::2]
@@ -238,7 +234,7 @@ def _mean_car() -> tuple[Floats, NDArray[np.int64]]:
     return (vertices - bottom) / (high - low), np.asarray(mesh.faces)
 
 
-def _outline(frame: FrameEvidence, car: int, yaw: float) -> tuple[NDArray[np.bool_], float]:
+def _outline(frame: FrameEvidence, car: int, yaw: float) -> tuple[Mask, float]:
     """Image of the mean car in the box of a car, scaled to its 2D box, and the aspect of the 2D box."""
     import cv2
 
@@ -257,7 +253,7 @@ def _outline(frame: FrameEvidence, car: int, yaw: float) -> tuple[NDArray[np.boo
     return drawn > 0, float((high - low)[0] / (high - low)[1])
 
 
-def _resized(mask: NDArray[np.bool_], around: Floats) -> NDArray[np.bool_]:
+def _resized(mask: Mask, around: Floats) -> Mask:
     import cv2
 
     u0, v0, u1, v1 = around.astype(int)

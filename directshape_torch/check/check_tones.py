@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from directshape_torch.check.finding import Finding, Severity, found
+from directshape_torch.check.car_evidence import Floats, Image
+from directshape_torch.check.finding import Finding, Severity
+from directshape_torch.check.hypotheses import accepted
+from directshape_torch.check.mistakes import found
 
 # For 72 real and rendered pairs the 99th percentile is at least 219, the quantiles of the sides differ by at most 15,
 # at most 16 % are saturated, and the rows of the two sides correlate by at least 0.94.
 _DARK_LEVEL, _LEAST_SPREAD, _MOST_SATURATED = 64.0, 4.0, 0.5
 _MOST_APART, _LEAST_CORRELATION = 30.0, -0.3
 # Colours must be more alike by this, as a share and in levels, if red and blue are exchanged on one side.
-_EXCHANGED_SHARE, _EXCHANGED_LEVELS = 0.7, 2.0
+_EXCHANGED_SHARE, _EXCHANGED_LEVELS = 0.3, 2.0
 _QUANTILES = (5, 25, 50, 75, 95)
 _GREY = np.array([0.299, 0.587, 0.114])
 
 
-def check_tones(left: NDArray[np.uint8], right: NDArray[np.uint8], where: str) -> list[Finding]:
+def check_tones(left: Image, right: Image, where: str) -> list[Finding]:
     """The most severe finding from the levels of two images (H, W, 3), of each and compared, or none."""
     greys = {"left": left @ _GREY, "right": right @ _GREY}
     for side, grey in greys.items():
@@ -30,7 +32,7 @@ def check_tones(left: NDArray[np.uint8], right: NDArray[np.uint8], where: str) -
         return [_tones("error", where, measured, "invert the image that is a negative: 255 - image")]
     colours = [image.mean(axis=1) for image in (left, right)]
     as_they_are, exchanged = (float(np.abs(colours[0] - other).mean()) for other in (colours[1], colours[1][:, ::-1]))
-    if exchanged < _EXCHANGED_SHARE * as_they_are and as_they_are - exchanged > _EXCHANGED_LEVELS:
+    if accepted((-as_they_are, -exchanged), max(_EXCHANGED_SHARE * as_they_are, _EXCHANGED_LEVELS)):
         measured = (
             f"colours differ by {as_they_are:.1f} levels between the images, and by {exchanged:.1f} with red and blue "
             "exchanged in one of them"
@@ -46,7 +48,7 @@ def check_tones(left: NDArray[np.uint8], right: NDArray[np.uint8], where: str) -
     return []
 
 
-def _check_side(grey: NDArray[np.float64], where: str) -> Finding | None:
+def _check_side(grey: Floats, where: str) -> Finding | None:
     brightest, spread = float(np.percentile(grey, 99)), float(grey.std())
     saturated = float((grey > 253).mean())
     if spread < _LEAST_SPREAD and brightest >= _DARK_LEVEL:

@@ -13,7 +13,8 @@ import json
 from pathlib import Path
 
 from directshape_torch.check.check_dataset import check_dataset, report_content
-from directshape_torch.check.finding import CheckReport, unreadable
+from directshape_torch.check.finding import CheckReport
+from directshape_torch.check.mistakes import unreadable
 from directshape_torch.cli.options import add_data_options, add_lidar_option, dataset_of
 from directshape_torch.cli.progress import Bar
 from directshape_torch.errors import DataFormatError
@@ -55,8 +56,6 @@ def _report(args: argparse.Namespace) -> CheckReport:
     try:
         dataset = dataset_of(args)
     except DataFormatError as error:
-        expected = f"data in the layout {args.layout!r} (docs/inputs.md)"
-        found = unreadable("layout", "all frames", expected, error, "check the path and the layout")
-        return CheckReport((found,), 0, 0, 0)
+        return CheckReport((unreadable("layout", "all frames", error, layout=args.layout),), 0, 0, 0)
     with Bar(total=min(len(dataset), max_frames or len(dataset)), desc="check", unit="frame") as bar:
         return check_dataset(dataset, max_frames, lambda _: bar.update())

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 import directshape_torch
-from directshape_torch.check.check_images import with_images
-from directshape_torch.check.finding import found
+from directshape_torch.check.check_images import check_frame
+from directshape_torch.check.mistakes import words_of_files
 from directshape_torch.io.image_files import read_pair
 
 TRAINING = Path(directshape_torch.__file__).parent / "assets" / "demo" / "training"
@@ -15,6 +17,12 @@ TRAINING = Path(directshape_torch.__file__).parent / "assets" / "demo" / "traini
 def test_matches_alone_settle_a_doubt_about_intrinsics() -> None:
     left, right = (next((TRAINING / folder).glob("000000.*")) for folder in ("image_2", "image_3"))
     pair = read_pair(left, right)
-    doubt = found("raw_intrinsics", "frame a", "left and right differ", severity="warning")
-    assert with_images([doubt], pair, None, "frame a", match_images=False) == [doubt]
-    assert with_images([doubt], pair, None, "frame a", match_images=True) == []
+    height, width = pair[0].shape[:2]
+    K = np.array([[0.6 * width, 0.0, 0.5 * width], [0.0, 0.6 * width, 0.5 * height], [0.0, 0.0, 1.0]])
+    numbers = ({"left": K, "right": K + np.array([[0, 0, 0], [0, 0, 1], [0, 0, 0]])}, 0.5)
+    for match_images, said in ((False, [("raw_intrinsics", "warning")]), (True, [])):
+        of_frame, _, usable = check_frame(
+            numbers, None, pair, (height, width), "frame a", words_of_files(Path("calib.txt")), match_images
+        )
+        assert [(one.check, one.severity) for one in of_frame] == said
+        assert usable is pair

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 import directshape_torch
 from directshape_torch.check import check_dataset as module
 from directshape_torch.check.check_dataset import check_dataset
-from directshape_torch.check.check_frame import numbers_of
 from directshape_torch.check.check_images import PairMatches, check_calibration, check_pair
 from directshape_torch.check.check_places import check_distances
-from directshape_torch.check.finding import MISTAKES, CheckReport, Finding, by_severity, found, unreadable
-from directshape_torch.check.words import KITTI_FILES, words_of_files, words_of_tensors
+from directshape_torch.check.finding import CheckReport, Finding, by_severity
+from directshape_torch.check.mistakes import MISTAKES, found, unreadable, words_of_files, words_of_tensors
+from directshape_torch.check.read_frame import numbers_of
 from directshape_torch.cli.main import main
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.box_formats import BoxFormat
@@ -32,6 +32,7 @@ from directshape_torch.io.kitti_calibration import KittiCalibration
 from directshape_torch.io.stereo_dataset import LayoutName, open_dataset
 
 SIZE_HW = (400, 1200)
+KITTI_WORDS = words_of_files(Path("calib.txt"))
 K = np.array([[700.0, 0, 600], [0, 700, 200], [0, 0, 1]])
 
 
@@ -85,8 +86,8 @@ def test_a_turned_camera_is_told_from_one_that_is_tilted() -> None:
 def test_errors_come_first_and_files_say_their_own_cure() -> None:
     note, error = (Finding("a", severity, "", "", "", "") for severity in ("note", "error"))
     assert by_severity([note, error]) == (error, note)
-    for text, cure in (("a.json: is empty; write it", "write it"), ("a.json: is empty", "check it")):
-        finding = unreadable("mask_file", "frame 1", "a list", ValueError(text), "check it")
+    for text, cure in (("a.json: is empty; write it", "write it"), ("a.json: is empty", "check the path and the file")):
+        finding = unreadable("mask_file", "frame 1", ValueError(text))
         assert (finding.measured, finding.cure) == ("a.json: is empty", cure)
 
 
@@ -116,7 +117,7 @@ def test_rows_may_differ_as_the_calibration_says() -> None:
     ],
 )
 def test_calibrations(found: KittiCalibration, expected: list[str]) -> None:
-    findings = check_calibration(*numbers_of(found), SIZE_HW, "frame 1", KITTI_FILES)
+    findings = check_calibration(*numbers_of(found), SIZE_HW, "frame 1", KITTI_WORDS)
     assert [finding.check for finding in findings] == expected
     assert all(finding.where == "frame 1" or "of calib.txt" in finding.where for finding in findings)
 
@@ -187,7 +188,7 @@ def test_intrinsics_of_raw_images_have_one_name(raw: np.ndarray) -> None:
 
 def test_intrinsics_that_differ_are_said_without_matches_once(kitti: Path, tmp_path: Path) -> None:
     for right, severity in ((FOCAL_RIGHT, "warning"), (np.diag([1.2, 1.2, 1.0]) @ K, "error")):
-        findings = check_calibration(*numbers_of(calibration(right=right)), None, "frame 1", KITTI_FILES)
+        findings = check_calibration(*numbers_of(calibration(right=right)), None, "frame 1", KITTI_WORDS)
         assert [(each.check, each.severity) for each in findings] == [("raw_intrinsics", severity)]
     write_folder(kitti, tmp_path, ("000000", "000001"))
     path = tmp_path / "rig.json"
@@ -235,7 +236,8 @@ def test_every_kind_of_mistake_has_words_in_every_source() -> None:
     needed = {check for check, kind in MISTAKES.items() if not kind.expected}
     for words in sources:
         # Tensors have positive baselines, or none are made; and cars, or nothing is looked at.
-        made = needed - ({"baseline_sign", "no_cars"} if not words.calibration_file else set())
+        of_files = {"baseline_sign", "no_cars", "calibration_file", "detection_file"}
+        made = needed - (of_files if "no_cars" not in words.says else set())
         for check in made:
             finding = found(check, "here", "this", words=words, low=0, high=1, limit=0.5)
             assert all((finding.expected, finding.cure))

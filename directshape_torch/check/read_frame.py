@@ -1,4 +1,4 @@
-"""This module checks one frame; parts are read separately, so that a damaged file does not hide other mistakes."""
+"""This module reads one frame for the checks; parts are read apart, so that a damaged file does not hide a mistake."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from directshape_torch.check.car_evidence import CarBoxes, FrameEvidence, Pair, Scan, reread_boxes
-from directshape_torch.check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, with_images
-from directshape_torch.check.finding import Finding, found, names, unreadable
-from directshape_torch.check.words import Words, words_of_files
+from directshape_torch.check.car_evidence import CarBoxes, Floats, FrameEvidence, Pair, Scan
+from directshape_torch.check.check_images import Numbers, check_frame
+from directshape_torch.check.finding import Finding
+from directshape_torch.check.mistakes import Words, found, unreadable, words_of_files
 from directshape_torch.errors import DataFormatError, DirectShapeError
 from directshape_torch.geometry.image_boxes import box_iou, project_boxes
 from directshape_torch.geometry.stereo_camera import StereoCamera
@@ -37,24 +36,23 @@ _SOME_MASKS = 3
 class _Attempts:
     """An `_Attempts` reads the parts of a frame and keeps the findings about unreadable parts."""
 
-    def __init__(self, where: str) -> None:
-        self.where, self.findings = where, list[Finding]()
+    def __init__(self, where: str, words: Words) -> None:
+        self.where, self.words, self.findings = where, words, list[Finding]()
 
-    def __call__(self, check: str, expected: str, read: Callable[[], _Part]) -> _Part | None:
+    def __call__(self, check: str, read: Callable[[], _Part]) -> _Part | None:
         try:
             return read()
         except (DirectShapeError, OSError) as error:
-            if isinstance(error, MaskSizeError):
-                check, expected = "mask_size", "masks of the size of their image"
-            found = unreadable(check, self.where, expected, error, "check the path and the file")
+            check = "mask_size" if isinstance(error, MaskSizeError) else check
+            finding = unreadable(check, self.where, error, self.words)
             is_missing = isinstance(error, DataFormatError) and not error.path.exists()
             # Missing files are reported for all frames at once, and one file may contain several parts.
-            if not is_missing and found.measured not in {finding.measured for finding in self.findings}:
-                self.findings.append(found)
+            if not is_missing and finding.measured not in {each.measured for each in self.findings}:
+                self.findings.append(finding)
             return None
 
 
-def check_frame(
+def read_frame(
     dataset: StereoDataset, frame_id: str, match_images: bool = True
 ) -> tuple[list[Finding], int, FrameEvidence | None]:
     """All findings about a frame, the number of its cars, and the evidence of its cars.
@@ -62,46 +60,45 @@ def check_frame(
     The evidence is None if images or calibration are wrong. Features of the two images are matched only if
     `match_images`.
     """
-    files, attempt = dataset.layout.files(frame_id), _Attempts(f"frame {frame_id}")
-    words = words_of_files(files.calibration)
+    files = dataset.layout.files(frame_id)
+    attempt = _Attempts(f"frame {frame_id}", words_of_files(files.calibration))
     pair = _read_pair(files, attempt)
-    calibration = attempt("calibration_file", words.calibration_file, files.read_calibration)
-    words = words if calibration is None else words_of_files(files.calibration, calibration.names)
+    calibration = attempt("calibration_file", files.read_calibration)
+    if calibration is not None:
+        attempt.words = words_of_files(files.calibration, calibration.names)
     size_hw = None if pair is None else (pair[0].shape[0], pair[0].shape[1])
     if size_hw is not None and calibration is not None:
         same_size = partial(calibration.of_size, size_hw[::-1])
-        if attempt("image_size", "the size that the calibration is of", same_size) is None:
+        if attempt("image_size", same_size) is None:
             pair = size_hw = None  # other checks of these would only report the same mistake again
-    objects = attempt("detection_file", words.detection_file, files.read_objects)
+    objects = attempt("detection_file", files.read_objects)
     masks = None
     if size_hw is not None and dataset.masks is not None:
-        masks = attempt("mask_file", "masks of both images", partial(dataset.masks.read, frame_id, size_hw))
-    attempt("plane_file", "a x + b y + c z + d = 0 with |b| near 1", files.read_plane)
-    findings, camera = attempt.findings, None
+        masks = attempt("mask_file", partial(dataset.masks.read, frame_id, size_hw))
+    attempt("plane_file", files.read_plane)
+    numbers = camera = None
     if calibration is not None:
-        findings += check_calibration(*numbers_of(calibration), size_hw, attempt.where, words)
-        # A calibration without a stereo pair was reported above. A singular matrix raises RuntimeError.
+        numbers = numbers_of(calibration)
+        # A calibration without a stereo pair has a finding. A singular matrix raises RuntimeError.
         with suppress(DirectShapeError, RuntimeError):
             camera = to_stereo_camera(calibration)
-    # A wrong calibration must not affect the checks of the images themselves.
-    camera = None if names(findings) & SPOILS_CAMERA else camera
-    if pair is not None:
-        findings = with_images(findings, pair, camera, attempt.where, match_images)
+    of_images, camera, pair_for_cars = check_frame(
+        numbers, camera, pair, size_hw, attempt.where, attempt.words, match_images
+    )
+    attempt.findings += of_images
     cars = [o for o in objects or [] if o.type in dataset.classes and o.has_box_3d]
     if camera is None or size_hw is None:
-        return findings, len(cars), None
-    evidence = _evidence(frame_id, cars, masks, camera, size_hw, words)
+        return attempt.findings, len(cars), None
+    evidence = _evidence(frame_id, cars, masks, camera, size_hw, attempt.words)
     none = int((evidence.boxes.box_2d == 0).all(axis=1).sum())
     if none:
         measured = (
             f"{none} of {len(evidence.boxes)} detections have no 2D box of their own (-1, zeros, or one for several)"
         )
         cure = "nothing, where masks are found: by the projected 3D boxes; AP by KITTI's rules needs 2D boxes"
-        findings.append(found("box_2d", attempt.where, measured, severity="note", cure=cure))
-    scan = attempt(
-        "lidar_file", "points of x, y, z, reflectance, and where the scanner is", partial(_scan, dataset, files)
-    )
-    return findings, len(cars), replace(evidence, scan=scan, pair=None if names(findings) & SPOILS_PAIR else pair)
+        attempt.findings.append(found("box_2d", attempt.where, measured, severity="note", cure=cure))
+    scan = attempt("lidar_file", partial(_scan, dataset, files))
+    return attempt.findings, len(cars), replace(evidence, scan=scan, pair=pair_for_cars)
 
 
 def _scan(dataset: StereoDataset, files: FrameFiles) -> Scan | None:
@@ -114,20 +111,18 @@ def _scan(dataset: StereoDataset, files: FrameFiles) -> Scan | None:
 
 
 def _read_pair(files: FrameFiles, attempt: _Attempts) -> Pair | None:
-    left = attempt("left_image", "a whole PNG or JPEG", partial(read_colours, files.left))
-    right = attempt("right_image", "a whole PNG or JPEG", partial(read_colours, files.right))
+    left = attempt("left_image", partial(read_colours, files.left))
+    right = attempt("right_image", partial(read_colours, files.right))
     if left is None or right is None:
         return None
-    return attempt("image_size", "one size", partial(as_pair, left, right, files.right))
+    return attempt("image_size", partial(as_pair, left, right, files.right))
 
 
-def numbers_of(calibration: KittiCalibration) -> tuple[dict[str, NDArray[np.float64]], float]:
+def numbers_of(calibration: KittiCalibration) -> Numbers:
     """Intrinsics by camera, and the baseline in metres, which is NaN if a focal length is 0."""
-    P = {
-        f"{name} of {calibration.path.name}": matrix
-        for name, matrix in zip(calibration.names, (calibration.P2, calibration.P3), strict=True)
-    }
-    shift = [matrix[0, 3] / (matrix[0, 0] or np.nan) for matrix in P.values()]
+    matrices = (calibration.P2, calibration.P3)
+    P = {f"{name} of {calibration.path.name}": matrix for name, matrix in zip(calibration.names, matrices, strict=True)}
+    shift = [matrix[0, 3] / (matrix[0, 0] or np.nan) for matrix in matrices]
     return {name: matrix[:, :3] for name, matrix in P.items()}, float(shift[0] - shift[1])
 
 
@@ -144,11 +139,11 @@ def _evidence(
     Masks of the right image are compared with the same boxes, which should fit them less well.
     """
     boxes = CarBoxes(
-        _columns([o.location_ref for o in cars], 3),
-        _columns([o.hwl for o in cars], 3),
-        np.array([o.rotation_y for o in cars], dtype=np.float64),
-        np.array([o.alpha for o in cars], dtype=np.float64),
-        own_boxes_2d(cars),
+        location=_columns([o.location_ref for o in cars], 3),
+        hwl=_columns([o.hwl for o in cars], 3),
+        rotation_y=np.array([o.rotation_y for o in cars], dtype=np.float64),
+        alpha=np.array([o.alpha for o in cars], dtype=np.float64),
+        box_2d=own_boxes_2d(cars),
     )
     # Without a 2D box in the file the mask can only be found by the projected 3D box.
     T_cam_obj = poses_cam(cars, camera.t_cam_ref[0])
@@ -159,22 +154,18 @@ def _evidence(
     overlap = {side: np.nan_to_num(box_iou(expected, around[side])) for side in SIDES}
     matches = {side: assign(np.where(each >= MIN_OVERLAP, each, 0.0)) for side, each in overlap.items()}
     rows = _telling(cars, matches["left"], boxes.box_2d)
-    own = {side: [None if (k := matches[side][row]) < 0 else of_cars[side][k] for row in rows] for side in SIDES}
-    nothing = (np.nan,) * 4
+    # The last row, which a match of -1 takes, is that of no mask.
+    nothing = np.full((1, 4), np.nan)
+    own = {side: np.concatenate([around[side], nothing])[[matches[side][row] for row in rows]] for side in SIDES}
+    whole = tuple(mask.whole(size_hw) for mask in of_cars["left"])
     return FrameEvidence(
         frame_id=frame_id,
         boxes=boxes.chosen(rows),
-        mask_boxes={
-            side: _columns([nothing if mask is None else mask.mask_box for mask in own[side]], 4) for side in SIDES
-        },
-        overlap={
-            side: np.array([overlap[side][row, k] if (k := matches[side][row]) >= 0 else 0.0 for row in rows])
-            for side in SIDES
-        },
+        mask_boxes=own,
         num_masks={side: len(of_cars[side]) for side in SIDES},
         seen=(around["left"],) * len(rows),
-        masks=tuple(None if mask is None else mask.whole(size_hw) for mask in own["left"]),
-        reread=reread_boxes(mask.whole(size_hw) for mask in of_cars["left"]),
+        masks=tuple(whole[k] if (k := matches["left"][row]) >= 0 else None for row in rows),
+        car_masks=whole,
         camera=camera,
         size_hw=size_hw,
         has_masks=masks is not None,
@@ -185,7 +176,7 @@ def _evidence(
 def _telling(
     cars: Sequence[KittiObject],
     masks_left: Sequence[int],
-    boxes_2d: NDArray[np.float64],  # (N, 4)
+    boxes_2d: Floats,  # (N, 4)
 ) -> list[int]:
     """The rows of the most informative cars, chosen as in `Detections.telling_rows`.
 
@@ -198,5 +189,5 @@ def _telling(
     return sorted(sorted(rows, key=lambda row: (masks_left[row] < 0, -(cars[row].score or 0.0)))[:MOST_TELLING])
 
 
-def _columns(rows: Sequence[tuple[float, ...]], count: int) -> NDArray[np.float64]:
+def _columns(rows: Sequence[tuple[float, ...]], count: int) -> Floats:
     return np.array(rows, dtype=np.float64).reshape(-1, count)
