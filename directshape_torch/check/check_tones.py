@@ -20,50 +20,45 @@ _GREY = np.array([0.299, 0.587, 0.114])
 
 
 def check_tones(left: Image, right: Image, where: str) -> list[Finding]:
-    """The most severe finding from the levels of two images (H, W, 3), of each and compared, or none."""
+    """The first finding from the levels of two images (H, W, 3), of each and compared, or none."""
     greys = {"left": left @ _GREY, "right": right @ _GREY}
-    for side, grey in greys.items():
-        if finding := _check_side(grey, f"{where}, {side} image"):
-            return [finding]
-    rows = [grey.mean(axis=1) for grey in greys.values()]
-    correlation = float(np.corrcoef(*rows)[0, 1]) if min(row.std() for row in rows) > 1 else 1.0
-    if correlation < _LEAST_CORRELATION:
-        measured = f"rows that are bright in one image are dark in the other (correlation {correlation:.2f})"
-        return [_tones("error", where, measured, "invert the image that is a negative: 255 - image")]
-    colours = [image.mean(axis=1) for image in (left, right)]
-    as_they_are, exchanged = (float(np.abs(colours[0] - other).mean()) for other in (colours[1], colours[1][:, ::-1]))
-    if accepted((-as_they_are, -exchanged), max(_EXCHANGED_SHARE * as_they_are, _EXCHANGED_LEVELS)):
-        measured = (
-            f"colours differ by {as_they_are:.1f} levels between the images, and by {exchanged:.1f} with red and blue "
-            "exchanged in one of them"
-        )
-        return [_tones("warning", where, measured, "give both images as RGB: OpenCV reads BGR, image[..., ::-1]")]
-    quantiles = [np.percentile(grey, _QUANTILES) for grey in greys.values()]
-    apart = float(np.abs(quantiles[0] - quantiles[1]).max())
-    if apart > _MOST_APART:
-        medians = " and ".join(f"{quantile[2]:.0f}" for quantile in quantiles)
-        measured = f"grey levels differ by up to {apart:.0f} between the images (medians {medians})"
-        cure = "expose and convert both cameras alike: gain, gamma, number of bits"
-        return [_tones("warning", where, measured, cure)]
-    return []
+    wrong = [
+        (f"{where}, {side} image", *said) for side, grey in greys.items() if (said := _wrong_in_one(grey)) is not None
+    ]
+    if not wrong and (said := _wrong_in_both(left, right, *greys.values())) is not None:
+        wrong = [(where, *said)]
+    return [found("grey_levels", at, measured, severity=how, cure=cure) for at, how, measured, cure in wrong[:1]]
 
 
-def _check_side(grey: Floats, where: str) -> Finding | None:
-    brightest, spread = float(np.percentile(grey, 99)), float(grey.std())
-    saturated = float((grey > 253).mean())
+def _wrong_in_one(grey: Floats) -> tuple[Severity, str, str] | None:
+    brightest, spread, saturated = float(np.percentile(grey, 99)), float(grey.std()), float((grey > 253).mean())
     if spread < _LEAST_SPREAD and brightest >= _DARK_LEVEL:
-        cure = "check the file: the image shows nothing"
-        return _tones("error", where, f"grey levels spread by {spread:.1f} alone", cure)
+        return "error", f"grey levels spread by {spread:.1f} alone", "check the file: the image shows nothing"
     if brightest < _DARK_LEVEL:
-        measured = f"99 % of the pixels are darker than {brightest:.0f} of 255"
         cure = "use the whole range: images of 10 or 12 bits are scaled to 8 or 16 before they are written"
-        return _tones("warning", where, measured, cure)
+        return "warning", f"99 % of the pixels are darker than {brightest:.0f} of 255", cure
     if saturated > _MOST_SATURATED:
         measured = f"{saturated:.0%} of the pixels are white".replace("%", " %")
-        cure = "check exposure and conversion: what is white has no texture to compare"
-        return _tones("warning", where, measured, cure)
+        return "warning", measured, "check exposure and conversion: what is white has no texture to compare"
     return None
 
 
-def _tones(severity: Severity, where: str, measured: str, cure: str) -> Finding:
-    return found("grey_levels", where, measured, severity=severity, cure=cure)
+def _wrong_in_both(left: Image, right: Image, *greys: Floats) -> tuple[Severity, str, str] | None:
+    rows = [grey.mean(axis=1) for grey in greys]
+    correlation = float(np.corrcoef(*rows)[0, 1]) if min(row.std() for row in rows) > 1 else 1.0
+    if correlation < _LEAST_CORRELATION:
+        measured = f"rows that are bright in one image are dark in the other (correlation {correlation:.2f})"
+        return "error", measured, "invert the image that is a negative: 255 - image"
+    colours = [image.mean(axis=1) for image in (left, right)]
+    given, exchanged = (float(np.abs(colours[0] - other).mean()) for other in (colours[1], colours[1][:, ::-1]))
+    if accepted((-given, -exchanged), max(_EXCHANGED_SHARE * given, _EXCHANGED_LEVELS)):
+        measured = f"colours differ by {given:.1f} levels between the images, and by {exchanged:.1f} with red and blue "
+        cure = "give both images as RGB: OpenCV reads BGR, image[..., ::-1]"
+        return "warning", f"{measured}exchanged in one of them", cure
+    quantiles = [np.percentile(grey, _QUANTILES) for grey in greys]
+    apart = float(np.abs(quantiles[0] - quantiles[1]).max())
+    if apart <= _MOST_APART:
+        return None
+    medians = " and ".join(f"{quantile[2]:.0f}" for quantile in quantiles)
+    measured = f"grey levels differ by up to {apart:.0f} between the images (medians {medians})"
+    return "warning", measured, "expose and convert both cameras alike: gain, gamma, number of bits"

@@ -14,116 +14,93 @@ Says = tuple[str, str]  # the expectation and the cure of a mistake, with fields
 
 
 class Mistake(NamedTuple):
-    """A `Mistake` is a kind of mistake; kinds without texts have them in `Words`, in terms of the source of data."""
+    """A `Mistake` is a kind of mistake that has the same texts for every source of data, with fields in braces."""
 
-    severity: Severity
-    expected: str = ""
-    cure: str = ""
+    expected: str
+    cure: str
+    severity: Severity = "error"
 
 
 _CHECK_FILE = "check the path and the file"
 MISTAKES: dict[str, Mistake] = {
-    "layout": Mistake("error", "data in the layout '{layout}' (docs/inputs.md)", "check the path and the layout"),
+    "layout": Mistake("data in the layout '{layout}' (docs/inputs.md)", "check the path and the layout"),
     "missing_files": Mistake(
-        "error", "every frame to have all of its files", "add them, or leave the frames out with --split or --frames"
+        "every frame to have all of its files", "add them, or leave the frames out with --split or --frames"
     ),
-    "left_image": Mistake("error", "a whole PNG or JPEG", _CHECK_FILE),
-    "right_image": Mistake("error", "a whole PNG or JPEG", _CHECK_FILE),
-    "image_size": Mistake("error", "images of one size, that of the calibration", _CHECK_FILE),
-    "calibration_file": Mistake("error"),
-    "detection_file": Mistake("error"),
-    "mask_file": Mistake("error", "masks of both images", _CHECK_FILE),
-    "plane_file": Mistake("error", "a x + b y + c z + d = 0 with |b| near 1", _CHECK_FILE),
-    "lidar_file": Mistake("error", "points of x, y, z, reflectance, and where the scanner is", _CHECK_FILE),
+    "left_image": Mistake("a whole PNG or JPEG", _CHECK_FILE),
+    "right_image": Mistake("a whole PNG or JPEG", _CHECK_FILE),
+    "image_size": Mistake("images of one size, that of the calibration", _CHECK_FILE),
+    "mask_file": Mistake("masks of both images", _CHECK_FILE),
+    "plane_file": Mistake("a x + b y + c z + d = 0 with |b| near 1", _CHECK_FILE),
+    "lidar_file": Mistake("points of x, y, z, reflectance, and where the scanner is", _CHECK_FILE),
     "focal_length": Mistake(
-        "error",
         "the same within 5 percent, as rectified images have",
         "scale fx, cx with the width and fy, cy with the height of resized images",
     ),
     "raw_intrinsics": Mistake(
-        "error",
         "the intrinsics of the rectified images: one focal length and one row of the centre for both",
         "give K = P[:, :3] of the rectified cameras, not K of the raw ones (a ROS camera_info has both, OpenCV's "
         "stereoRectify returns P1 and P2), and the baseline -P_right[0, 3] / P_right[0, 0]",
     ),
     "principal_point": Mistake(
-        "warning",
         "near the middle of the image",
         "use the intrinsics of this size of image; cutting moves the point, resizing scales it",
+        "warning",
     ),
-    "baseline_sign": Mistake("error"),
-    "baseline_length": Mistake("error"),
     "images_swapped": Mistake(
-        "error",
         "disparities u_left - u_right above 0: everything lies farther left in the right image",
         "swap the left and the right images (or were they mirrored?)",
     ),
-    "image_mirrored": Mistake(
-        "error", "two images of the same sense", "mirror the one that is read in the wrong direction"
-    ),
+    "image_mirrored": Mistake("two images of the same sense", "mirror the one that is read in the wrong direction"),
     "same_image": Mistake(
-        "error", "disparity between the two images", "give the right camera's images, not copies of the left ones"
+        "disparity between the two images", "give the right camera's images, not copies of the left ones"
     ),
     "different_scenes": Mistake(
-        "error",
         "at least {share:.0%} of them",
         "check that left and right file of a frame carry the same name, and that neither is mirrored",
     ),
     "not_rectified": Mistake(
-        "error",
         "within {limit} px of what the calibration says",
         "rectify the pair (cv2.stereoRectify and initUndistortRectifyMap) with the calibration that is given",
     ),
     "not_synchronous": Mistake(
-        "warning", "at most {limit} px", "give images taken at the same moment, with lens distortion removed"
+        "at most {limit} px", "give images taken at the same moment, with lens distortion removed", "warning"
     ),
     "few_matches": Mistake(
-        "note", "at least {limit}", "nothing, where the images have little texture; the pair was not checked"
+        "at least {limit}", "nothing, where the images have little texture; the pair was not checked", "note"
     ),
     "grey_levels": Mistake(
-        "warning", "photographs of 0 to 255, alike on both sides", "expose and convert both cameras alike"
+        "photographs of 0 to 255, alike on both sides", "expose and convert both cameras alike", "warning"
     ),
     "mask_size": Mistake(
-        "error",
         "masks of the size of their image",
         "resize the masks to the size of the images, not the images to that of the masks",
     ),
     "masks_elsewhere": Mistake(
-        "error",
         "at least {limit}",
         "check that masks and detections are of the same frames and the same size of image, and that 2D boxes are "
         "u_min v_min u_max v_max",
     ),
     "masks_swapped": Mistake(
-        "error",
         "left boxes that fit left masks, and cars farther left in the right image",
         "swap the two sides of the masks (or detections and masks were made on the right image)",
     ),
-    "no_masks": Mistake("error"),
-    "box_2d": Mistake("error", "u_min v_min u_max v_max, pixels", "add x to the width and y to the height"),
-    "box_axes": Mistake("error"),
-    "box_origin": Mistake("error"),
-    "box_yaw": Mistake("error"),
-    "box_order": Mistake("error"),
-    "box_units": Mistake("error"),
-    "box_projection": Mistake("error"),
-    "no_cars": Mistake("error"),
+    "box_2d": Mistake("u_min v_min u_max v_max, pixels", "add x to the width and y to the height"),
     "rig_offset": Mistake(
-        "warning",
         "within {limit} px",
         "nothing for 'directshape refine', which estimates it (--rig auto); for more evidence: 'calibrate-rig'",
+        "warning",
     ),
     "detector_bias": Mistake(
-        "warning",
         "within {limit}",
         "check focal length and baseline, or the detector's training; 'directshape refine' goes by the images",
+        "warning",
     ),
     "lidar_elsewhere": Mistake(
-        "error",
         "at least {limit}",
         "no known way to read the scans fits: check that scan and images are of the same frame, and Tr_velo_to_cam",
     ),
-    "distance_scale": Mistake("error", "within {limit:.0%}", "check focal length, baseline and the units of the boxes"),
+    "distance_scale": Mistake("within {limit:.0%}", "check focal length, baseline and the units of the boxes"),
 }
 
 
@@ -247,9 +224,9 @@ def found(
     **fields: float | str,
 ) -> Finding:
     """A finding with the texts of the table or of its source, unless other texts are given."""
-    usual, *texts = MISTAKES[check]
-    said = texts if words is None else words.says.get(check, texts)
-    return Finding(check, severity or usual, where, measured, expected or said[0].format(**fields), cure or said[1])
+    kind = MISTAKES[check] if words is None or check in MISTAKES else Mistake(*words.says[check])
+    expected = expected or kind.expected.format(**fields)
+    return Finding(check, severity or kind.severity, where, measured, expected, cure or kind.cure)
 
 
 def unreadable(check: str, where: str, error: Exception, words: Words | None = None, layout: str = "") -> Finding:

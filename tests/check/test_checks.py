@@ -233,13 +233,12 @@ def test_every_kind_of_mistake_has_words_in_every_source() -> None:
         words_of_files(Path("calib.txt"), ("P_rect_02", "P_rect_03")),
         words_of_files(Path("rig.json")),
     ]
-    needed = {check for check, kind in MISTAKES.items() if not kind.expected}
+    of_files = {"baseline_sign", "no_cars", "calibration_file", "detection_file"}
     for words in sources:
         # Tensors have positive baselines, or none are made; and cars, or nothing is looked at.
-        of_files = {"baseline_sign", "no_cars", "calibration_file", "detection_file"}
-        made = needed - (of_files if "no_cars" not in words.says else set())
-        for check in made:
-            finding = found(check, "here", "this", words=words, low=0, high=1, limit=0.5)
+        assert set(words.says) in (set(KITTI_WORDS.says), set(KITTI_WORDS.says) - of_files)
+        for check in (*words.says, *MISTAKES):
+            finding = found(check, "here", "this", words=words, low=0, high=1, limit=0.5, share=0.5, layout="kitti")
             assert all((finding.expected, finding.cure))
     raw = found("baseline_sign", "here", "this", words=sources[-2])
     assert raw.cure.startswith("swap P_rect_02 and P_rect_03")
