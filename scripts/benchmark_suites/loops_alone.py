@@ -5,7 +5,6 @@ Their time is a bound of our own: a call would take it if nothing but its loops 
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -17,6 +16,7 @@ import torch
 from benchmark_suites.timing import Row, Spread, time_interleaved
 from directshape_torch import Detections, DirectShapeRefiner, FrameBatch
 from directshape_torch.errors import MissingDependencyError
+from directshape_torch.kernels.arguments import Rays
 
 _LOOPS = "march", "silhouettes", "photometric"
 _Record: TypeAlias = list[tuple[Callable[..., None], tuple[Any, ...]]]
@@ -28,7 +28,7 @@ def loops_row(name: str, calls: Sequence[tuple[FrameBatch, Detections]], rounds:
     Raises:
         MissingDependencyError: Numba is not installed.
     """
-    refiner, seconds, counts = DirectShapeRefiner(), [], []
+    refiner, seconds, sizes = DirectShapeRefiner(), [], []
     for call in calls:
         refine = partial(refiner, *call)
         with torch.no_grad():
@@ -37,9 +37,12 @@ def loops_row(name: str, calls: Sequence[tuple[FrameBatch, Detections]], rounds:
                 refine()
             sides = {"call": refine, "loops": partial(_repeat, record)}
             seconds.append(time_interleaved(sides, rounds, of_processor=True))
-        counts.append(Counter(loop.__name__ for loop, _ in record))
+        sizes.append({name: [_num_rows(a) for loop, a in record if loop.__name__ == name] for name in _LOOPS})
     whole, share = (median(1e3 * s["call"] for s in seconds), median(s["loops"] / s["call"] for s in seconds))
-    each = ", ".join(f"{median(count[loop] for count in counts):g} of {loop}" for loop in _LOOPS)
+    each = ", ".join(
+        f"{median(len(call[name]) for call in sizes):g} of {name} ({median(sum(call[name]) for call in sizes):g} rows)"
+        for name in _LOOPS
+    )
     note = f"{share:.2g} of the {whole:.4g} ms of a call; {each}"
     return Row(f"{name}, loops alone: ms", Spread.of([1e3 * s["loops"] for s in seconds]), note)
 
@@ -74,3 +77,8 @@ def recorded_loops() -> Iterator[_Record]:
 def _repeat(record: _Record) -> None:
     for loop, arguments in record:
         loop(*arguments)
+
+
+def _num_rows(arguments: tuple[Any, ...]) -> int:
+    """The number of rays of a loop, with the empty places of their blocks."""
+    return sum(each.ray_cam[0].size for each in arguments if isinstance(each, Rays))

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -70,7 +71,8 @@ def peer_rows(data_root: Path | None, quick: bool = False) -> Iterator[Row]:
 
 def fit_rows(name: str, calls: Sequence[_Call], peers: Mapping[str, _Fit], rounds: int) -> Iterator[Row]:
     """Milliseconds of the fits of calls, and where they end, relative to this library's with native loops."""
-    fits = {"native loops": partial(fit, by_this_library), "tensor operations": _fit_without_loops, **peers}
+    own = {"tensor operations": _fit_without_loops, "forward mode": _fit_in_forward_mode}
+    fits = {"native loops": partial(fit, by_this_library), **own, **peers}
     # Without tolerances every car takes all steps.
     refiner = DirectShapeRefiner(config=load_config(None, ["solver.cost_tolerance=0", "solver.step_tolerance=0"]))
     steps = sum(stage.max_iterations for stage in refiner.config.stages)
@@ -118,6 +120,12 @@ def fit(solve: Solve, problem: CarProblem, state: CarState) -> CarState:
 def _fit_without_loops(problem: CarProblem, state: CarState) -> CarState:
     with without_kernels():
         return fit(by_this_library, problem, state)
+
+
+def _fit_in_forward_mode(problem: CarProblem, state: CarState) -> CarState:
+    """The fit of this library with the Jacobians that the peers use, of all cars at once."""
+    config = replace(problem.config, solver=replace(problem.config.solver, jacobian="autograd"))
+    return fit(by_this_library, replace(problem, config=config), state)
 
 
 def by_this_library(iterations: CarIterations, at: Evaluation, state: CarState, steps: int) -> CarState:

@@ -65,8 +65,9 @@ def test_loops_alone_are_a_part_of_a_call() -> None:
     row = loops_row("one frame", [CALL], 1)
     share, counts = float(row.note.split()[0]), row.note.split("; ")[1].split(", ")
     assert 0 < share < 1
-    assert [count.split(" of ")[1] for count in counts] == ["march", "silhouettes", "photometric"]
+    assert [count.split()[2] for count in counts] == ["march", "silhouettes", "photometric"]
     assert all(int(count.split()[0]) > 2 for count in counts)
+    assert all(int(count.partition("(")[2].partition(" rows")[0]) > 1000 for count in counts)
 
 
 def test_a_missing_peer_is_told_with_its_cure(
@@ -78,6 +79,8 @@ def test_a_missing_peer_is_told_with_its_cure(
 
 
 @pytest.mark.skipif(not (find_spec("pypose") and find_spec("theseus")), reason="the peers are not installed")
+# Theseus takes tensors for arrays in a way that NumPy 2 disapproves of.
+@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
 def test_peers_end_where_the_library_does(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = replace(SCENE, frames=(first_cars(SCENE.frames[0], 1),))
     monkeypatch.setattr(peers, "load_scenes", lambda *_: (scene,))
@@ -86,6 +89,7 @@ def test_peers_end_where_the_library_does(monkeypatch: pytest.MonkeyPatch) -> No
         "loops alone",
         "native loops",
         "tensor operations",
+        "forward mode",
         "PyPose",
         "Theseus",
     ]
