@@ -54,9 +54,12 @@ def test_operations_and_tensors_alive_at_once_are_counted() -> None:
     assert abs(peak_tensor_bytes(call) - 3 * mega) < 1024
 
 
-def test_each_side_is_timed_by_itself_in_an_order_that_turns_round(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("read", "of_processor"), [("perf_counter", False), ("process_time", True)])
+def test_each_side_is_timed_by_itself_in_an_order_that_turns_round(
+    read: str, of_processor: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     clock, called = FakeClock(), []
-    monkeypatch.setattr("time.perf_counter", clock)
+    monkeypatch.setattr(f"time.{read}", clock)
     took = {"slow": iter((9.0, 3.0, 4.0, 3.0)), "fast": iter((9.0, 0.5, 0.5, 2.0))}
 
     def side(name: str) -> Callable[[], None]:
@@ -66,7 +69,8 @@ def test_each_side_is_timed_by_itself_in_an_order_that_turns_round(monkeypatch: 
 
         return call
 
-    assert time_interleaved({name: side(name) for name in took}, 3) == {"slow": 3.0, "fast": 0.5}
+    sides = {name: side(name) for name in took}
+    assert time_interleaved(sides, 3, of_processor=of_processor) == {"slow": 3.0, "fast": 0.5}
     assert called == ["slow", "fast", "slow", "fast", "fast", "slow", "slow", "fast"]
 
 
