@@ -86,11 +86,8 @@ def evidence_of_scene(frames: FrameBatch, detections: Detections) -> list[FrameE
     if detections.is_from_masks is not None:
         known &= ~detections.is_from_masks.cpu().numpy()
     rows = [[row for row in detections.telling_rows(number) if known[row]] for number in range(len(frames))]
-    return [_frame_evidence(frames, number, _rows(detections, chosen), words) for number, chosen in enumerate(rows)]
-
-
-def _rows(detections: Detections, chosen: Sequence[int]) -> Detections:
-    return detections.rows(torch.tensor(chosen, dtype=torch.int64, device=detections.T_cam_obj.device))
+    chosen = [torch.tensor(some, dtype=torch.int64, device=detections.T_cam_obj.device) for some in rows]
+    return [_frame_evidence(frames, number, detections.rows(some), words) for number, some in enumerate(chosen)]
 
 
 def _frame_evidence(frames: FrameBatch, number: int, cars: Detections, words: Words) -> FrameEvidence:

@@ -62,16 +62,21 @@ def measure_cars(frame: FrameEvidence) -> Floats:
     """
     if frame.pair is None:
         return np.empty((0, 3))
-    around, camera = frame.mask_boxes["left"], frame.camera
-    shift = float(camera.K_left[0, 0, 2] - camera.K_right[0, 0, 2])
+    around, camera, boxes = frame.mask_boxes["left"], frame.camera, frame.boxes
     with np.errstate(invalid="ignore"):
-        tall = (around[:, 3] - around[:, 1] >= _MIN_HEIGHT_PX) & (frame.boxes.location[:, 2] > 0)
-    rows = []
-    for car in np.flatnonzero(tall).tolist():
-        disparity = _patch_disparity(*frame.pair, around[car])
-        if np.isfinite(disparity):
-            rows.append((disparity - shift, *_ratios(frame, car, disparity)))
-    return np.array(rows, dtype=np.float64).reshape(-1, 3)
+        tall = (around[:, 3] - around[:, 1] >= _MIN_HEIGHT_PX) & (boxes.location[:, 2] > 0)
+    disparity = np.array([_patch_disparity(*frame.pair, around[car]) for car in np.flatnonzero(tall)])
+    cars = np.flatnonzero(tall)[np.isfinite(disparity)]
+    disparity, around, boxes = disparity[np.isfinite(disparity)], around[cars], boxes.chosen(cars.tolist())
+    middle = torch.from_numpy((around[:, :2] + around[:, 2:]) / 2)
+    K_left, K_right = camera.K_left[0], camera.K_right[0]
+    depth = depth_from_disparity(middle, torch.from_numpy(disparity), K_left, K_right, camera.T_right_cam[0]).numpy()
+    by_size = float(K_left[1, 1]) * boxes.hwl[:, 0] / (around[:, 3] - around[:, 1] + 1)
+    # This is the depth of the centre of the visible surface.
+    z, yaw = boxes.location[:, 2] + float(camera.t_cam_ref[0, 2]), boxes.rotation_y
+    extent = np.abs(boxes.hwl[:, 2] * np.sin(yaw)) + np.abs(boxes.hwl[:, 1] * np.cos(yaw))
+    surface = np.maximum(0.3 * z, z - _SURFACE_SHARE * extent)
+    return np.column_stack([disparity - float(K_left[0, 2] - K_right[0, 2]), depth / surface, by_size / surface])
 
 
 def _patch_disparity(left: Image, right: Image, box: Floats) -> float:
@@ -102,26 +107,6 @@ def _patch_disparity(left: Image, right: Image, box: Floats) -> float:
         bend = score[best - 1] - 2 * score[best] + score[best + 1]
         offset = 0.5 * (score[best - 1] - score[best + 1]) / bend if bend < 0 else 0.0
     return float((u0 - first) - (best + offset) / scale)
-
-
-def _ratios(frame: FrameEvidence, car: int, disparity: float) -> tuple[float, float]:
-    camera, box = frame.camera, frame.mask_boxes["left"][car]
-    at = torch.tensor([(box[0] + box[2]) / 2, (box[1] + box[3]) / 2], dtype=torch.float64)
-    measured = depth_from_disparity(
-        at, torch.tensor(disparity, dtype=torch.float64), camera.K_left[0], camera.K_right[0], camera.T_right_cam[0]
-    )
-    by_size = float(camera.K_left[0, 1, 1]) * float(frame.boxes.hwl[car, 0]) / float(box[3] - box[1] + 1)
-    z = _surface_depth(frame, car)
-    return float(measured) / z, by_size / z
-
-
-def _surface_depth(frame: FrameEvidence, car: int) -> float:
-    """Depth of the centre of the visible surface, metres."""
-    _, width, length = frame.boxes.hwl[car]
-    yaw = frame.boxes.rotation_y[car]
-    extent = abs(length * np.sin(yaw)) + abs(width * np.cos(yaw))
-    z = float(frame.boxes.location[car, 2] + frame.camera.t_cam_ref[0, 2])
-    return max(0.3 * z, z - _SURFACE_SHARE * float(extent))
 
 
 def check_swapped(cars: Floats) -> list[Finding]:
