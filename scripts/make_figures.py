@@ -26,6 +26,7 @@ from pathlib import Path
 
 from command_line import run_command
 
+from directshape_torch.batch.refine_dataset import package_version
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.evaluation.comparison import compare_results
 from directshape_torch.evaluation.tables import number
@@ -198,9 +199,10 @@ def row(name: str, refinement: Refinement, data: Path, out: Path) -> str:
 
 
 def commit() -> str:
-    """The commit of this checkout; "-dirty" follows where files differ from it."""
+    """The commit of this checkout, followed by "-dirty" where files differ from it; the version without a repository."""
     command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--exclude=*"]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    return found.stdout.strip() or f"version {package_version()}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
