@@ -18,12 +18,14 @@ class DirectShapeError(Exception):
         super().__init__(shortened(message, _LONGEST_MESSAGE))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Other processes make the error of its message, whatever its constructor takes.
+        # Constructors take other arguments than the message, so another process makes the error without them.
         return _made_anew, (type(self), self.args), vars(self)
 
 
 def _made_anew(kind: type[DirectShapeError], args: tuple[object, ...]) -> DirectShapeError:
-    return kind.__new__(kind, *args)
+    error = kind.__new__(kind, *args)
+    super(DirectShapeError, error).__init__(*args)
+    return error
 
 
 class InputError(DirectShapeError, ValueError):

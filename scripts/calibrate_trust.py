@@ -174,12 +174,13 @@ def _by_one_root(runs: Sequence[Cars], rows: Rows, limits: AcceptanceConfig) -> 
         cells = []
         for root in roots:
             some = [run for run in others_of(runs, row) if run.root == root]
-            cells.append("")
-            if some:
-                judged = _judged(runs, row, fitted(some))
-                cells[-1] = _cell(judged.cars, judged.chosen(judged.cars, limits), with_spread=False)
+            cells.append(_returned(_judged(runs, row, fitted(some)), limits) if some else "")
         lines.append(f"| {' '.join(row)} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def _returned(row: JudgedRow, limits: AcceptanceConfig) -> str:
+    return _cell(row.cars, row.chosen(row.cars, limits), with_spread=False)
 
 
 def _count(flags: Sequence[NDArray[np.bool_]]) -> str:
@@ -194,7 +195,7 @@ def _thresholds(rows: Rows, limits: AcceptanceConfig) -> str:
         cells = []
         for least in THRESHOLDS:
             other = replace(limits, min_probability_not_worse=least)
-            cells.append(_cell(row.cars, row.chosen(row.cars, other), with_spread=False))
+            cells.append(_returned(row, other))
         lines.append(f"| {root} {detector} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 

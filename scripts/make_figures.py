@@ -3,10 +3,11 @@
     python scripts/make_figures.py --out out/figures         # about an hour of two cores
     python scripts/make_figures.py --only masks_rendered     # some commands
 
-The data lie in DIRECTSHAPE_DATA. The words of each command, from which it can be given by itself, are below. What one
-has printed is kept in OUT/NAME.txt with the commit and the command, and is not made again for these. `OUT/figures.md`
-joins all of them. A row of a refinement has the cars of the labels that count, with a mask, the mean BEV IoU before and
-after, the share that fell by more than 0.05, and the share of axes that are right within 20 degrees.
+The data lie in DIRECTSHAPE_DATA. The words of each command, from which it can be given by itself, are below. Some need
+what others wrote before. OUT/COMMIT/NAME.txt keeps what a command has printed, so that a second call does not run it
+again. `OUT/COMMIT/figures.md` joins what has been printed. A row of a refinement has the cars of the labels that count,
+with a mask, the mean BEV IoU before and after, the share that fell by more than 0.05, and the share of axes that are
+right within 20 degrees.
 """
 
 from __future__ import annotations
@@ -132,21 +133,25 @@ def run(args: argparse.Namespace) -> None:
         InputError: DIRECTSHAPE_DATA is not set, or a name is none of the commands.
         DirectShapeError: a command failed; OUT/NAME.err has what it said.
     """
-    data, out = os.environ.get("DIRECTSHAPE_DATA"), args.out.resolve()
+    data, version = os.environ.get("DIRECTSHAPE_DATA"), commit()
     if not data:
         raise InputError("DIRECTSHAPE_DATA", "the folder of kitti15, kitti and rendered", "nothing")
+    if version.endswith("-dirty"):
+        raise InputError("the checkout", "the files of its commit", "files that differ", "commit them")
+    out = args.out.resolve() / version
     if unknown := set(args.only or ()) - set(NAMES):
         raise InputError("--only", f"names among {', '.join(NAMES)}", ", ".join(sorted(unknown)))
     write_inputs(Path(data), out)
-    printed: dict[str, str] = {}
     for group in GROUPS:
         names = [name for name in group if args.only is None or name in args.only]
-        made = partial(what_it_prints, data=data, out=out, workers=args.workers)
+        made = partial(make, data=data, out=out, workers=args.workers)
         with ThreadPoolExecutor(args.workers) as pool:
-            printed |= zip(names, pool.map(made, names), strict=True)
+            list(pool.map(made, [name for name in names if not (out / f"{name}.txt").exists()]))
+    kept = {name: out / f"{name}.txt" for name in NAMES}
+    printed = {name: path.read_text(encoding="utf-8") for name, path in kept.items() if path.exists()}
     rows = ["| | cars | before | after | worse | axis right |", "|---|---|---|---|---|---|"]
     rows += [printed[name].strip() for name in REFINEMENTS if name in printed]
-    parts = [f"Commit {commit()}", "\n".join(rows)]
+    parts = [f"Commit {version}", "\n".join(rows)]
     parts += [f"## {name}\n\n{printed[name].strip()}" for name in OTHERS if name in printed]
     write_text(out / "figures.md", "\n\n".join(parts) + "\n")
     print((out / "figures.md").read_text(encoding="utf-8"), end="")
@@ -165,25 +170,18 @@ def write_inputs(data: Path, out: Path) -> None:
         write_text(out / "left_masks" / path.name, json.dumps(masks))
 
 
-def what_it_prints(name: str, data: str, out: Path, workers: int) -> str:
-    """What a command prints, which is a row of the table for a refinement."""
+def make(name: str, data: str, out: Path, workers: int) -> None:
+    """Keep what a command prints, which is a row of the table for a refinement."""
     refinement = REFINEMENTS.get(name)
     template = OTHERS[name] if refinement is None else refinement.command(f"{{out}}/{name}")
-    words = shlex.split(template.format(data=data, out=out, workers=workers))
-    head, kept = f"{commit()}: {shlex.join(words)}\n", out / f"{name}.txt"
-    if kept.exists() and (text := kept.read_text(encoding="utf-8")).startswith(head):
-        return text.removeprefix(head)
+    words = [word.format(data=data, out=out, workers=workers) for word in shlex.split(template)]
     print(f"{name} begins", file=sys.stderr, flush=True)
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, *words], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
-    )
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, *words], cwd=ROOT, env=env, capture_output=True, text=True, check=False)
     if done.returncode:
         write_text(out / f"{name}.err", done.stderr)
         raise DirectShapeError(f"{name} failed with exit code {done.returncode}; see {out / name}.err")
-    text = done.stdout if refinement is None else row(name, refinement, Path(data), out)
-    write_text(kept, head + text)
-    return text
+    write_text(out / f"{name}.txt", done.stdout if refinement is None else row(name, refinement, Path(data), out))
 
 
 def row(name: str, refinement: Refinement, data: Path, out: Path) -> str:
@@ -199,7 +197,7 @@ def row(name: str, refinement: Refinement, data: Path, out: Path) -> str:
 
 
 def commit() -> str:
-    """The commit of this checkout, followed by "-dirty" where files differ from it; the version without a repository."""
+    """The commit of this checkout, with "-dirty" where files differ from it; the version if there is no repository."""
     command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--exclude=*"]
     found = subprocess.run(command, capture_output=True, text=True, check=False)
     return found.stdout.strip() or f"version {package_version()}"

@@ -21,8 +21,8 @@ from directshape_torch.errors import DirectShapeError
 
 # A process may be killed by chance, because others take the memory.
 _TRIES = 2
-# If this many frames for each process are lost before any frame is finished, single frames are not the cause.
-_HOPELESS_FRAMES = 3
+# If so many groups for each process kill it before any frame is finished, single frames are not the cause.
+_HOPELESS_GROUPS = 5
 _DEATH = "killed, out of memory or crashed"
 
 
@@ -55,7 +55,7 @@ def reports_of(engine: Engine, job: RunJob, groups: Sequence[FrameGroup]) -> Ite
     """
     ended: SimpleQueue[Future[GroupReport]] = SimpleQueue()
     at_work: dict[Future[GroupReport], tuple[FrameGroup, int]] = {}
-    num_lost, has_report = 0, False
+    num_deaths, has_report = 0, False
 
     def hand_out(more: Sequence[FrameGroup], attempt: int = 1) -> None:
         for group in more:
@@ -70,14 +70,16 @@ def reports_of(engine: Engine, job: RunJob, groups: Sequence[FrameGroup]) -> Ite
         if (report := engine.report(future)) is not None:
             has_report = True
             yield report
-        elif attempt < _TRIES:
+            continue
+        # Of a group with a frame that kills, halves and repetitions die too, so only whole groups are counted.
+        num_deaths += attempt == 1 and group in groups
+        if not has_report and num_deaths >= _HOPELESS_GROUPS * engine.workers:
+            raise DirectShapeError(f"workers die before they finish any frame ({_DEATH}); is there enough memory?")
+        if attempt < _TRIES:
             hand_out([group], attempt + 1)
         elif len(group.frame_ids) > 1:
             hand_out(group.halves())
         else:
-            num_lost += 1
-            if not has_report and num_lost >= _HOPELESS_FRAMES * engine.workers:
-                raise DirectShapeError(f"workers die before they finish any frame ({_DEATH}); is there enough memory?")
             reason = f"its worker died each of {_TRIES} times ({_DEATH})"
             yield GroupReport({lost: write_failure(job.out_dir, lost, reason) for lost in group.wanted})
 
@@ -193,8 +195,8 @@ def _take_job(content: bytes) -> str | None:
 def _refine_here(group: FrameGroup) -> GroupReport:
     try:
         return refine_group(_jobs[0], group)
-    except DirectShapeError:
-        raise
-    # An error of a user's own code that the parent cannot read would look like the death of this process.
+    # An error of a user's own class that the parent cannot read would look like the death of this process.
     except Exception as error:
+        if type(error).__module__.startswith("directshape_torch."):
+            raise
         raise DirectShapeError(f"{type(error).__name__}: {error}") from None

@@ -101,6 +101,8 @@ class RayEngine:
         try:
             return future.result()
         except self._ray.exceptions.RayTaskError as error:
+            if isinstance(error.cause, DirectShapeError):
+                raise error.cause from None
             raise DirectShapeError(_last_line(error)) from error
         except self._ray.exceptions.RayError:
             return None

@@ -79,7 +79,7 @@ def _pairs(one: _Refine, other: _Refine, inputs: _Inputs, rounds: int) -> Iterat
             yield pair
 
 
-def _apart(native: RefinementResult, plain: RefinementResult) -> tuple[torch.Tensor, int]:
+def _apart(one: RefinementResult, other: RefinementResult) -> tuple[torch.Tensor, int]:
     """Distances (N,) between the ends of cars, metres, and how many statuses differ."""
-    apart_m = (native.T_cam_obj[:, :3, 3] - plain.T_cam_obj[:, :3, 3]).norm(dim=1)
-    return apart_m, sum(one is not other for one, other in zip(native.status, plain.status, strict=True))
+    apart_m = (one.T_cam_obj[:, :3, 3] - other.T_cam_obj[:, :3, 3]).norm(dim=1)
+    return apart_m, sum(a is not b for a, b in zip(one.status, other.status, strict=True))

@@ -39,12 +39,12 @@ from directshape_torch.terms.term import Evaluation
 
 _SCENES = "rendered", "kitti15"
 _SINGLE_FRAMES, _BATCH_FRAMES, _ROUNDS = 3, 8, 3
+# Two ends agree where their costs differ by this share of the cost at the start at most.
 _NEAR = 0.01
-"""Two ends agree where their costs differ by this share of the cost at the start at most."""
 _Call: TypeAlias = tuple[FrameBatch, Detections]
 _Fit: TypeAlias = Callable[[CarProblem, CarState], CarState]
+# A `Solve` takes a number of steps from a state, whose evaluation is known, and returns the state where they end.
 Solve: TypeAlias = Callable[[CarIterations, Evaluation, CarState, int], CarState]
-"""It takes a number of steps from a state, whose evaluation is known, and returns the state where they end."""
 
 
 def peer_rows(data_root: Path | None, quick: bool = False) -> Iterator[Row]:

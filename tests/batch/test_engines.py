@@ -74,7 +74,15 @@ def test_the_frame_that_kills_is_found_among_its_companions(tmp_path: Path) -> N
 def test_workers_that_never_finish_anything_end_the_run(tmp_path: Path) -> None:
     with pytest.raises(DirectShapeError, match=r"workers die before they finish any frame \(killed"):
         ends(Imagined(lambda _: True), tmp_path)
-    assert sorted(path.stem for path in (tmp_path / "failed").iterdir()) == ["a", "b"]
+    assert not (tmp_path / "failed").exists()
+
+
+def test_many_groups_that_kill_end_the_run_before_all_are_tried(tmp_path: Path) -> None:
+    workers = Imagined(lambda _: True)
+    groups = frame_groups([f"{number:06d}" for number in range(4000)], 4, ())
+    with pytest.raises(DirectShapeError, match="before they finish any frame"):
+        list(reports_of(workers, SimpleNamespace(out_dir=tmp_path), groups))
+    assert workers.calls[len(groups) :] == [group.frame_ids for group in groups[:4]]
 
 
 def test_a_killer_in_each_half_of_one_group_does_not_end_the_run(tmp_path: Path) -> None:

@@ -154,4 +154,5 @@ def test_a_run_that_is_asked_to_end_says_so(tmp_path: Path) -> None:
     # The message stands behind the bar if the signal arrives while the bar is drawn.
     assert run.returncode == 143
     assert said.endswith("directshape: terminated\n")
+    assert "Traceback" not in said
     assert read_status(out).num_left > 0
