@@ -21,7 +21,7 @@ from directshape_torch.errors import DirectShapeError
 
 # A process may be killed by chance, because others take the memory.
 _TRIES = 2
-# If so many groups for each process kill it before any frame is finished, single frames are not the cause.
+# If so many groups in a row for each process kill it, single frames are not the cause.
 _HOPELESS_GROUPS = 5
 _DEATH = "killed, out of memory or crashed"
 
@@ -51,11 +51,11 @@ def reports_of(engine: Engine, job: RunJob, groups: Sequence[FrameGroup]) -> Ite
     that were finished in spite of it are not repeated, since `refine_group` finds their files.
 
     Raises:
-        DirectShapeError: processes die before any of them has finished a frame.
+        DirectShapeError: processes die again and again, and none of them finishes a frame.
     """
     ended: SimpleQueue[Future[GroupReport]] = SimpleQueue()
     at_work: dict[Future[GroupReport], tuple[FrameGroup, int]] = {}
-    num_deaths, has_report = 0, False
+    num_deaths = 0
 
     def hand_out(more: Sequence[FrameGroup], attempt: int = 1) -> None:
         for group in more:
@@ -68,13 +68,13 @@ def reports_of(engine: Engine, job: RunJob, groups: Sequence[FrameGroup]) -> Ite
         future = ended.get()
         group, attempt = at_work.pop(future)
         if (report := engine.report(future)) is not None:
-            has_report = True
+            num_deaths = 0
             yield report
             continue
         # Of a group with a frame that kills, halves and repetitions die too, so only whole groups are counted.
         num_deaths += attempt == 1 and group in groups
-        if not has_report and num_deaths >= _HOPELESS_GROUPS * engine.workers:
-            raise DirectShapeError(f"workers die before they finish any frame ({_DEATH}); is there enough memory?")
+        if num_deaths >= _HOPELESS_GROUPS * engine.workers:
+            raise DirectShapeError(f"workers die again and again ({_DEATH}); is there enough memory?")
         if attempt < _TRIES:
             hand_out([group], attempt + 1)
         elif len(group.frame_ids) > 1:

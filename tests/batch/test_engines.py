@@ -72,17 +72,19 @@ def test_the_frame_that_kills_is_found_among_its_companions(tmp_path: Path) -> N
 
 
 def test_workers_that_never_finish_anything_end_the_run(tmp_path: Path) -> None:
-    with pytest.raises(DirectShapeError, match=r"workers die before they finish any frame \(killed"):
+    with pytest.raises(DirectShapeError, match=r"workers die again and again \(killed"):
         ends(Imagined(lambda _: True), tmp_path)
     assert not (tmp_path / "failed").exists()
 
 
-def test_many_groups_that_kill_end_the_run_before_all_are_tried(tmp_path: Path) -> None:
-    workers = Imagined(lambda _: True)
+@pytest.mark.parametrize("num_good", [0, 3])
+def test_many_groups_that_kill_end_the_run_before_all_are_tried(tmp_path: Path, num_good: int) -> None:
     groups = frame_groups([f"{number:06d}" for number in range(4000)], 4, ())
-    with pytest.raises(DirectShapeError, match="before they finish any frame"):
+    workers = Imagined(lambda group: group not in groups[:num_good])
+    with pytest.raises(DirectShapeError, match="die again and again"):
         list(reports_of(workers, SimpleNamespace(out_dir=tmp_path), groups))
-    assert workers.calls[len(groups) :] == [group.frame_ids for group in groups[:4]]
+    bad = [group.frame_ids for group in groups[num_good:]]
+    assert workers.calls[len(groups) :] == bad[:4]
 
 
 def test_a_killer_in_each_half_of_one_group_does_not_end_the_run(tmp_path: Path) -> None:
