@@ -71,7 +71,7 @@ def reports_of(engine: Engine, job: RunJob, groups: Sequence[FrameGroup]) -> Ite
             num_deaths = 0
             yield report
             continue
-        # Of a group with a frame that kills, halves and repetitions die too, so only whole groups are counted.
+        # A frame that kills its worker does so in halves and repetitions too, so each whole group is counted once.
         num_deaths += attempt == 1 and group in groups
         if num_deaths >= _HOPELESS_GROUPS * engine.workers:
             raise DirectShapeError(f"workers die again and again ({_DEATH}); is there enough memory?")

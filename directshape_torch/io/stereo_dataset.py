@@ -141,14 +141,7 @@ def open_dataset(
             other classes than cars are to be made of masks, or `tracks` is used in a layout without sequences.
     """
     if isinstance(layout, str):
-        if layout not in _LAYOUTS:
-            raise InputError("layout", f"one of {', '.join(_LAYOUTS)}", repr(layout))
-        name, layout = layout, _LAYOUTS[layout](root, detections_dir)
-        if layout.detections_dir is None and masks is None:
-            expected = f"a folder of detections for the layout {name!r}"
-            raise InputError(
-                "detections", expected, "none", "--detections DIR, or masks alone, of which boxes are made"
-            )
+        layout = _named_layout(layout, root, detections_dir, masks is not None)
     if ground not in get_args(GroundSource):
         raise InputError("ground", f"one of {', '.join(get_args(GroundSource))}", repr(ground))
     frame_ids = chosen_frames(layout, split, frames)
@@ -173,6 +166,16 @@ def open_dataset(
         tracks,
         dtype,
     )
+
+
+def _named_layout(name: str, root: Path | str, detections_dir: Path | str | None, has_masks: bool) -> FrameLayout:
+    if name not in _LAYOUTS:
+        raise InputError("layout", f"one of {', '.join(_LAYOUTS)}", repr(name))
+    layout = _LAYOUTS[name](root, detections_dir)
+    if layout.detections_dir is None and not has_masks:
+        expected = f"a folder of detections for the layout {name!r}"
+        raise InputError("detections", expected, "none", "--detections DIR, or masks alone, of which boxes are made")
+    return layout
 
 
 def _mask_source(layout: FrameLayout, masks: Path | str | MaskSource | None, first: FrameFiles) -> MaskSource | None:
