@@ -23,7 +23,7 @@ from directshape_torch.numerics.tensors import made_once
 # float64's rounding. Unlike the ratios, the series have finite derivatives of every order at zero.
 _SERIES_ANGLE_SQUARED = 0.35
 # These are the coefficients of powers of -a^2, the highest first, in (1 - cos a)/a^2 and (a - sin a)/a^3.
-_EXP_SERIES = tuple((1 / math.factorial(2 * n + 2), 1 / math.factorial(2 * n + 3)) for n in range(6, -1, -1))
+EXP_SERIES = tuple((1 / math.factorial(2 * n + 2), 1 / math.factorial(2 * n + 3)) for n in range(6, -1, -1))
 
 
 def generators(dtype: torch.dtype = torch.float64, device: torch.device | str | None = None) -> Tensor:
@@ -42,7 +42,7 @@ class _ExpConstants(NamedTuple):
 
 @made_once
 def _exp_constants(dtype: torch.dtype, device: torch.device) -> _ExpConstants:
-    series = torch.tensor(_EXP_SERIES, dtype=dtype, device=device).unbind(0)
+    series = torch.tensor(EXP_SERIES, dtype=dtype, device=device).unbind(0)
     of_parts = generators(dtype, device).view(6, 16)
     part = of_parts.abs().argmax(dim=0)
     return _ExpConstants(part, of_parts.sum(dim=0), torch.eye(4, dtype=dtype, device=device), series)

@@ -52,6 +52,14 @@ class Rays(NamedTuple):
     T_obj_cam: Reals  # (B, 4, 4)
 
 
+class Turn(NamedTuple):
+    """A `Turn` says for B cars what a loop over blocks does with theirs."""
+
+    moving: Flags  # (B,) whether the blocks are evaluated
+    # (B,) whether they begin at the points where their last evaluation ended, and not at those where it began
+    taken: Flags
+
+
 class Search(NamedTuple):
     """A `Search` holds the bounds of a prior and the constants of `terms.depth` for searches of closest points."""
 
@@ -151,7 +159,113 @@ class Matching(NamedTuple):
 
     lost_grey_levels: Real
     huber_grey_levels: Real
-    # change of the inverse depth by the offset (B, S) of each car, and by a pixel of offset
-    inverse_depth: Reals
-    inverse_depth_per_px: Reals
+    offset_px: Reals  # (B, S) offset of the disparity
+    inverse_depth_per_px: Reals  # (B, S) change of the inverse depth by a pixel of offset
     centre: int  # which neighbour is the pixel itself
+
+
+class States(NamedTuple):
+    """`States` are the tensors of a `CarState`."""
+
+    T_obj_cam: Reals  # (B, 4, 4)
+    code: Reals  # (B, K)
+    offset_px: Reals  # (B, S)
+
+
+class Energies(NamedTuple):
+    """`Energies` are costs, gradients and Gauss-Newton matrices of B cars."""
+
+    cost: Doubles  # (B,)
+    gradient: Doubles  # (B, D)
+    hessian: Doubles  # (B, D, D)
+
+
+class Iterated(NamedTuple):
+    """`Iterated` is what changes from iteration to iteration, see `solver.problem.Progress`."""
+
+    damping: Doubles  # (B,)
+    stretched: Flags  # (B,)
+    ended: NDArray[np.int64]  # (B,)
+    iterations: NDArray[np.int64]  # (B,)
+
+
+class Steps(NamedTuple):
+    """`Steps` are what B cars try in an iteration."""
+
+    step: Doubles  # (B, D)
+    size: Doubles  # (B,) see `solver.damped_solve.step_size`
+    solvable: Flags  # (B,)
+
+
+class Rules(NamedTuple):
+    """`Rules` are the settings of a stage's iterations and the constants of the solver."""
+
+    largest_step: Doubles  # (D,) trusted
+    held: Flags  # (D,) whether the stage fixes an unknown
+    max_code: float
+    over_relaxation: float
+    step_tolerance: float
+    cost_tolerance: float
+    changes_damping: bool
+    damping_decrease: float
+    damping_increase: float
+    least_damping: float
+    most_damping: float
+    flat: float
+    least_diagonal: float  # share of the largest entry
+    least_pivot: float
+    converged: int  # codes of statuses
+    singular: int
+
+
+class Family(NamedTuple):
+    """A `Family` is a `PCAShapePrior`, and the grids of B cars: a grid is the mean and the code times the basis."""
+
+    mean: Reals  # (nodes,)
+    basis: Reals  # (K, nodes)
+    values: Reals  # (B * nodes,)
+
+
+class Iteration(NamedTuple):
+    """An `Iteration` is what the iterations of a stage read and write."""
+
+    rules: Rules
+    family: Family
+    rest: Doubles  # (B,) cost of rows that cannot change
+    state: States
+    at: Energies  # at the state
+    progress: Iterated
+    turn: Turn
+    steps: Steps
+    candidate: States  # the state after the step
+    at_candidate: Energies
+
+
+class BlockSums(NamedTuple):
+    """`BlockSums` are what the blocks of a term add to their cars."""
+
+    owner: NDArray[np.int64]  # (M,)
+    weight: Doubles  # (M,)
+    cost: Doubles  # (M,)
+    products: Doubles  # (M, D + 1, D)
+
+
+class PriorArrays(NamedTuple):
+    """`PriorArrays` are the weights and constants of `terms.priors`; a prior of weight 0 is left out."""
+
+    shape_weight: float
+    height_weight: float
+    tilt_weight: float
+    dimensions_weight: float
+    pose_weight: float
+    rig_weight: float
+    tilts_by_cosine: bool
+    ground_normal_cam: Reals  # (B, 3)
+    ground_offset: Reals  # (B,)
+    detector_hwl: Reals  # (B, 3)
+    hwl_mean: Reals  # (3,) of the family of shapes
+    hwl_basis: Reals  # (3, K)
+    hwl_sigma: Reals  # (3,)
+    detector_T_cam_obj: Reals  # (B, 4, 4)
+    pose_sigma: Reals  # (B, 4)
+    offset_sigma_px: Reals  # (B, S)

@@ -48,6 +48,12 @@ def put(points: Points, row: Index, point: Point) -> None:
 
 
 @step
+def copy_points(points: Points, into: Points) -> None:
+    for row in range(np.uint64(len(points[0]))):
+        put(into, row, at(points, row))
+
+
+@step
 def of_block(points: Reals, number: Index) -> Points:
     """The points (3, R) of a block, of points (3, M, R)."""
     return points[0, number], points[1, number], points[2, number]

@@ -110,3 +110,8 @@ def room_like(tensor: Tensor) -> Tensor:
 def native_rays(rays: Rays, T_obj_cam: Tensor) -> arguments.Rays:
     """Rays with the poses (B, 4, 4) of their cars."""
     return arguments.Rays(*map(array, (rays.owner, rays.centre_cam, rays.ray_cam, T_obj_cam)))
+
+
+def every_turn(num_cars: int) -> arguments.Turn:
+    """The evaluation of all cars near the points that a loop is given."""
+    return arguments.Turn(np.ones(num_cars, np.bool_), np.zeros(num_cars, np.bool_))

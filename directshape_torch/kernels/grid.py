@@ -46,6 +46,11 @@ def scaled(a: Point, factor: Real) -> Point:
 
 
 @step
+def cross(a: Point, b: Point) -> Point:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@step
 def each_clamped(point: Point, last: Point) -> Point:
     return clamp(point[0], ZERO, last[0]), clamp(point[1], ZERO, last[1]), clamp(point[2], ZERO, last[2])
 

@@ -129,7 +129,8 @@ def sample(grid: Grid, search: Search, block: Block, samples: Samples) -> None:
 def write_start(search: Search, samples: Samples, start: Reals) -> None:
     """Write the depths from which closest points are searched: the least samples, or the vertices beside them."""
     depth, sdf, least, rows = samples.depth, samples.sdf, samples.least, range(np.uint64(len(start)))
-    least[:], start[:] = ZERO, sdf[0]
+    for row in rows:
+        least[row], start[row] = ZERO, sdf[0, row]
     for s in range(np.uint64(1), np.uint64(len(sdf))):
         for row in rows:
             less = sdf[s, row] < start[row]

@@ -20,11 +20,13 @@ from directshape_torch.kernels.arguments import (
     Sums,
     SurfaceArrays,
     Tracking,
+    Turn,
 )
 from directshape_torch.kernels.block import (
     Block,
     at,
     block_of,
+    copy_points,
     of_block,
     on_ray,
     put,
@@ -81,19 +83,26 @@ def photometric(
     matching: Matching,
     rays: Rays,
     pixels: Pixels,
+    turn: Turn,
     before: SurfaceArrays,
     now: SurfaceArrays,
     out: Sums,
     _sources: int = SOURCES,
 ) -> None:
-    """Write the sums of all blocks and the surface under their pixels, which is tracked from that of a nearby state."""
-    num_rows, num_offsets = rays.ray_cam.shape[2], matching.inverse_depth.shape[1]
+    """Write the sums of blocks and the surface under their pixels, which is tracked from that of a nearby state."""
+    num_rows, num_offsets = rays.ray_cam.shape[2], matching.offset_px.shape[1]
     num_shape = 6 + grid.basis.shape[1]
     J = np.zeros((num_rows, num_shape + num_offsets), np.float32)
     weighted = np.empty((num_rows, J.shape[1] + 1), np.float32)
     room, found, patches = room_for(num_rows), found_for(num_rows), patches_for(num_rows)
     compared = compared_for(len(pixels.intensity_left), num_rows)
     for number in range(np.uint64(len(rays.owner))):
+        car = np.uint64(rays.owner[number])
+        if not turn.moving[car]:
+            continue
+        if turn.taken[car]:
+            copy_points(of_block(now.points_obj, number), of_block(before.points_obj, number))
+            copy_points(of_block(now.normal_obj, number), of_block(before.normal_obj, number))
         block, depth, usable = block_of(grid, rays, number, room), now.depth[number], now.usable[number]
         last, normal = of_block(before.points_obj, number), of_block(before.normal_obj, number)
         track(grid, tracking, block, last, normal, found)
@@ -101,8 +110,9 @@ def photometric(
         write_where(now.on_surface[number], block, found, last, of_block(now.points_obj, number))
         write_gradient_where(now.on_surface[number], found, normal, of_block(now.normal_obj, number))
         if num_offsets:
-            write_offset(tracking, matching, np.uint64(rays.owner[number]), depth, found.depth_per_sdf, J[:, num_shape])
-        usable[:] = now.on_surface[number]
+            write_offset(tracking, matching, car, depth, found.depth_per_sdf, J[:, num_shape])
+        for row in range(np.uint64(num_rows)):
+            usable[row] = now.on_surface[number, row]
         compare(pixels, tracking, number, depth, patches, compared, usable)
         drop_hidden(pixels, number, np.uint64(matching.centre), depth, patches, usable)
         add_neighbours(pixels, matching, number, usable, compared)
@@ -191,12 +201,14 @@ def write_offset(
     tracking: Tracking, matching: Matching, car: Index, depth: Reals, depth_per_sdf: Reals, J: Reals
 ) -> None:
     """Move the depths by the offset of the disparity, and write the derivative by it."""
+    per_px = matching.inverse_depth_per_px[car, 0]
+    inverse_depth = matching.offset_px[car, 0] * per_px
     for row in range(np.uint64(len(depth))):
-        ratio = ONE + depth[row] * matching.inverse_depth[car, 0]
+        ratio = ONE + depth[row] * inverse_depth
         # A point whose disparity would vanish is moved behind the camera, where it is lost.
         ratio = ratio if ratio > tracking.least_share else -ONE
         depth[row], depth_per_sdf[row] = depth[row] / ratio, depth_per_sdf[row] / (ratio * ratio)
-        J[row] = -depth[row] * depth[row] * matching.inverse_depth_per_px[car, 0]
+        J[row] = -depth[row] * depth[row] * per_px
 
 
 @step

@@ -18,11 +18,13 @@ from directshape_torch.kernels.arguments import (
     Reals,
     Search,
     Sums,
+    Turn,
 )
 from directshape_torch.kernels.block import (
     Block,
     at,
     block_of,
+    copy_points,
     of_block,
     on_ray,
     put,
@@ -50,24 +52,30 @@ def silhouettes(
     search: Search,
     rays: Rays,
     contour: Contour,
+    turn: Turn,
     before: ClosestArrays,
     now: ClosestArrays,
     out: Sums,
     _sources: int = SOURCES,
 ) -> None:
-    """Write the sums of all blocks and the closest points of their rays, which begin at those of a nearby state."""
+    """Write the sums of blocks and the closest points of their rays, which begin at those of a nearby state."""
     num_rows, num_columns = rays.ray_cam.shape[2], 6 + grid.basis.shape[1]
     J, weighted = np.empty((num_rows, num_columns), np.float32), np.empty((num_rows, num_columns + 1), np.float32)
-    wants_fisher, informed = out.information.shape[1] > 0, np.empty_like(J)
+    wants_fisher, informed = out.information.shape[1] > 0, np.empty_like(weighted)
     room, walk, start, three = (
         room_for(num_rows),
         walk_for(num_rows),
-        J[:, 0].copy(),
+        np.empty(num_rows, np.float32),
         np.empty((3, num_rows), np.float32),
     )
     probes = Probes(np.empty_like(start), three, np.empty_like(three))
     sdf, gradient = probes.sdf[0], probes.gradient
     for number in range(np.uint64(len(rays.owner))):
+        car = np.uint64(rays.owner[number])
+        if not turn.moving[car]:
+            continue
+        if turn.taken[car]:
+            copy_points(of_block(now.points_obj, number), of_block(before.points_obj, number))
         block, crosses, depth = block_of(grid, rays, number, room), now.crosses[number], now.depth[number]
         last, face = of_block(before.points_obj, number), of_block(now.face_obj, number)
         write_start(grid, search, contour, block, last, probes, start)
@@ -87,7 +95,7 @@ def silhouettes(
             weight = filled / max(residual, contour.residual_floor)
             write_weighted(J[row], weight * slope * slope, filled * slope, weighted[row])
             if wants_fisher:
-                informed[row] = filled * slope * slope * J[row]
+                write_weighted(J[row], filled * slope * slope, ZERO, informed[row])
         out.cost[number] = cost
         if wants_fisher:
             write_square(np.dot(informed.T, J), out.information[number], out.first)

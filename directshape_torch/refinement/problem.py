@@ -14,14 +14,16 @@ from typing import Annotated, Any, TypeAlias, cast
 import torch
 from torch import Tensor
 
-from directshape_torch.config import RefinerConfig, StageConfig
+from directshape_torch.config import RefinerConfig, SolverConfig, StageConfig
 from directshape_torch.numerics.gradient_mode import map_tensors
 from directshape_torch.numerics.records import Dense
 from directshape_torch.numerics.tables import Chosen, Table
+from directshape_torch.refinement.native_iterations import iterated
 from directshape_torch.rows import CarSums
 from directshape_torch.shape.field import Field, field_of
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.gauss_newton import Minimum
+from directshape_torch.solver.problem import Progress
 from directshape_torch.solver.sharing import INDEPENDENT, Sharing
 from directshape_torch.state.unknowns import LARGEST_ROTATION_RAD, AnyState, State, Unknowns
 from directshape_torch.terms.depth import marched_views
@@ -177,7 +179,8 @@ class CarStage:
         if self.problem.factors is not None:
             return self.terms
         own = len(self.problem.evidence)
-        return (*with_joined_priors(self.terms[:own]), *self.terms[own:])
+        joined = with_joined_priors(self.terms[:own], self.problem.config.priors, self.problem.prior)
+        return (*joined, *self.terms[own:])
 
     def linearise_differentiably(self, state: State) -> Evaluation:
         """The hand-derived linearisation with an autograd graph to state, images, masks, prior and weights."""
@@ -283,6 +286,19 @@ class CarIterations(Table):
         at = summed(self._sums, self.layout.weight, parts)
         cost = at.cost if self.rest is None else at.cost + self.rest
         return self.stage.without_held(at._replace(cost=cost))
+
+    def all_at_once(
+        self, progress: Progress[AnyState, Evaluation], stage: StageConfig, config: SolverConfig, limits: Tensor
+    ) -> list[tuple[Tensor, Tensor]] | None:
+        """All iterations of a stage, if each term has a native loop and cars share nothing; see `Iterations`."""
+        problem = self.stage.problem
+        is_tracked = self.masks is None and problem.config.solver.jacobian == "analytic"
+        if not is_tracked or self.factors is not None or self.sharing is not INDEPENDENT:
+            return None
+        held = ~self.stage.unknowns.moving(stage.unknowns, limits.device)
+        block_weights = self.layout.weight.split_with_sizes(self.layout.num_blocks)
+        terms = tuple(zip(self.terms, progress.at_state.anchors, block_weights, strict=True))
+        return iterated(problem.prior, terms, self.rest, progress, stage, config, limits, held)
 
     def choose(self, accepted: Tensor, new: Evaluation, old: Evaluation) -> Evaluation:
         """Take the new evaluation of cars whose step was accepted (B,), and the old one of all others."""

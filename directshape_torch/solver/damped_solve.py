@@ -7,9 +7,9 @@ from torch import Tensor
 
 # Damping acts on at least this share of the largest diagonal entry, so that directions that the data do not see at all
 # are damped as well.
-_RELATIVE_DIAGONAL_FLOOR = 1e-9
+LEAST_DIAGONAL = 1e-9
 # A system counts as singular below this pivot of its scaled factor, whose diagonal is 1 for independent unknowns.
-_SMALLEST_PIVOT = 1e-7
+LEAST_PIVOT = 1e-7
 
 
 def damped_step(
@@ -39,7 +39,7 @@ def damped_solution(
     scaled = torch.addcmul(matrix * scale.unsqueeze(2) * scale.unsqueeze(1), damping.view(-1, 1, 1), identity)
     factor, info = torch.linalg.cholesky_ex(scaled)
     # Numbers that are not finite end the factor early or make it NaN, and a comparison with NaN is false.
-    regular = (factor.diagonal(dim1=1, dim2=2).amin(dim=1) > _SMALLEST_PIVOT) & (info == 0)
+    regular = (factor.diagonal(dim1=1, dim2=2).amin(dim=1) > LEAST_PIVOT) & (info == 0)
     # A batch has no branches, so systems without a factor are solved with the identity and then dropped.
     factor = torch.where(regular.view(-1, 1, 1), factor, identity)
     solution = scale.unsqueeze(2) * torch.cholesky_solve(scale.unsqueeze(2) * right, factor)
@@ -50,7 +50,7 @@ def damped_solution(
 def floored_diagonal(matrix: Tensor) -> Tensor:
     """The diagonal (B, D) that damping acts on, with a small share of its largest entry as least value."""
     diagonal = matrix.diagonal(dim1=1, dim2=2)
-    return torch.maximum(diagonal, _RELATIVE_DIAGONAL_FLOOR * diagonal.amax(dim=1, keepdim=True))
+    return torch.maximum(diagonal, LEAST_DIAGONAL * diagonal.amax(dim=1, keepdim=True))
 
 
 def is_finite(sums: Tensor) -> Tensor:

@@ -14,8 +14,9 @@ from directshape_torch.config import SolverConfig, StageConfig
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.records import Dense
 from directshape_torch.numerics.tables import Chosen, Table
-from directshape_torch.solver.iteration import RUNNING, begin, has_failed, iterate, step_lengths
+from directshape_torch.solver.iteration import begin, has_failed, iterate, step_lengths
 from directshape_torch.solver.problem import (
+    RUNNING,
     EvaluationT,
     FiguresT,
     PreparedT,
@@ -157,6 +158,10 @@ def _run_stage(
     failed: set[int] = set()
     done = 0
     while done < stage.max_iterations:
+        at_once = part.all_at_once(progress, stage, config, limits) if trajectory is None else None
+        if at_once is not None:
+            costs += [(rows, *each) for each in at_once]
+            done = stage.max_iterations
         for _ in range(min(config.block_iterations, stage.max_iterations - done)):
             before, damping, stretched = progress.state, progress.damping, progress.stretched
             running, accepted, improved = iterate(part, progress, config, limits, stage.over_relaxation)

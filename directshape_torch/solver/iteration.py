@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Annotated, Generic
-
 import torch
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig
-from directshape_torch.numerics.records import Dense
-from directshape_torch.numerics.tables import Chosen, Table
 from directshape_torch.solver.damped_solve import is_finite, limit_step, step_size
-from directshape_torch.solver.problem import EnergyAt, EvaluationT, Iterations, StateT, put_rows, where_rows
+from directshape_torch.solver.problem import RUNNING, EnergyAt, EvaluationT, Iterations, Progress, StateT, where_rows
 from directshape_torch.status import Status
 
 
@@ -39,45 +34,13 @@ def step_lengths(stretched: Tensor, over_relaxation: float) -> Tensor:
     return torch.where(stretched, over_relaxation, 1.0)
 
 
-# A problem that goes on has this code; a problem that has ended has the code of its status.
-RUNNING = -1
 # Marquardt's mu changes by these factors after an accepted and after a refused step, within these bounds. A problem
 # whose step is refused at the upper bound has converged.
-_DAMPING_DECREASE, _DAMPING_INCREASE = 0.3, 8.0
-_LEAST_DAMPING, _MOST_DAMPING = 1e-7, 1e5
+DAMPING_DECREASE, DAMPING_INCREASE = 0.3, 8.0
+LEAST_DAMPING, MOST_DAMPING = 1e-7, 1e5
 # Where a refused step promises and changes at most this many tolerances of the cost, it is not too long: the cost is at
 # its lowest and rough, and more damping would not help.
-_FLAT = 10.0
-
-
-@dataclass
-class Progress(Table, Generic[StateT, EvaluationT]):
-    """`Progress` is what changes from iteration to iteration, for the problems of one compacted batch."""
-
-    state: StateT
-    best_state: StateT
-    best_cost: Annotated[Tensor, Dense("B")]
-    at_state: EvaluationT  # only the iterations know its axes
-    damping: Annotated[Tensor, Dense("B")]
-    # whether the next step is over-relaxed, in stages that over-relax
-    stretched: Annotated[Tensor, Dense("B", kind="flags")]
-    ended: Annotated[Tensor, Dense("B", kind="index")]  # status code or RUNNING
-    iterations: Annotated[Tensor, Dense("B", kind="index")]
-
-    def narrowed(
-        self, iterations: Iterations[StateT, EvaluationT], problems: Chosen
-    ) -> tuple[Iterations[StateT, EvaluationT], Progress[StateT, EvaluationT]]:
-        """The iterations of some of the problems, and their progress."""
-        at_state = iterations.evaluation_of(problems, self.at_state)
-        return iterations.of(problems), replace(self.of(problems), at_state=at_state)
-
-    def scatter(self, rows: Tensor, state: StateT, ended: Tensor, iterations: Tensor) -> tuple[StateT, Tensor, Tensor]:
-        """Best states, ends and iterations of all problems, with this batch put into its rows."""
-        return (
-            put_rows(state, rows, self.best_state),
-            ended.index_copy(0, rows, self.ended),
-            iterations.index_copy(0, rows, self.iterations),
-        )
+FLAT = 10.0
 
 
 def has_failed(ended: Tensor) -> Tensor:
@@ -139,7 +102,7 @@ def iterate(
     downhill = takeable & (decrease >= 0)
     accepted = takeable if config.accept_every_step else downhill
     # Undamped, a singular system stays singular; damped, more damping may help until the limit is reached.
-    at_limit = p.damping >= _MOST_DAMPING
+    at_limit = p.damping >= MOST_DAMPING
     p.iterations = p.iterations + running
     little = config.cost_tolerance * share.total(p.at_state.cost.abs(), takeable)
     small_decrease = decrease <= little
@@ -149,7 +112,7 @@ def iterate(
     if over_relaxation != 1:
         # A longer step may end beyond the minimum and about as high, so only a plain step shows that a problem settled.
         promised = share.total(-0.5 * (p.at_state.gradient * step).sum(dim=1), takeable)
-        changes_little = (promised <= _FLAT * little) & (-decrease <= _FLAT * little)
+        changes_little = (promised <= FLAT * little) & (-decrease <= FLAT * little)
         at_rest = takeable & ~accepted & changes_little
         has_settled, exhausted = ~p.stretched & (has_settled | at_rest), exhausted & ~p.stretched
         p.stretched = downhill & ~small_decrease
@@ -177,8 +140,8 @@ def _move(
     p.state = where_rows(accepted, candidate, p.state)
     p.at_state = problem.choose(accepted, at_candidate, p.at_state)
     if config.initial_damping > 0:
-        smaller = (p.damping * _DAMPING_DECREASE).clamp_min(_LEAST_DAMPING)
-        larger = (p.damping * _DAMPING_INCREASE).clamp_max(_MOST_DAMPING)
+        smaller = (p.damping * DAMPING_DECREASE).clamp_min(LEAST_DAMPING)
+        larger = (p.damping * DAMPING_INCREASE).clamp_max(MOST_DAMPING)
         p.damping = torch.where(accepted, smaller, larger)
     if not config.accept_every_step:
         # No uphill step is taken, so the present state is the best one.

@@ -7,13 +7,15 @@ each near the state before. All results are values, which a caller may keep for 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Protocol, Self, SupportsIndex, TypeVar, overload
+from dataclasses import dataclass, replace
+from typing import Annotated, Generic, Protocol, Self, SupportsIndex, TypeVar, overload
 
 import torch
 from torch import Tensor
 
-from directshape_torch.config import StageConfig
-from directshape_torch.numerics.tables import Chosen
+from directshape_torch.config import SolverConfig, StageConfig
+from directshape_torch.numerics.records import Dense
+from directshape_torch.numerics.tables import Chosen, Table
 from directshape_torch.solver.sharing import Sharing
 
 
@@ -64,6 +66,40 @@ FiguresT = TypeVar("FiguresT", bound=HasCost)
 FiguresT_co = TypeVar("FiguresT_co", bound=HasCost, covariant=True)
 
 
+# A problem that goes on has this code; a problem that has ended has the code of its status.
+RUNNING = -1
+
+
+@dataclass
+class Progress(Table, Generic[StateT, EvaluationT]):
+    """`Progress` is what changes from iteration to iteration, for the problems of one compacted batch."""
+
+    state: StateT
+    best_state: StateT
+    best_cost: Annotated[Tensor, Dense("B")]
+    at_state: EvaluationT  # only the iterations know its axes
+    damping: Annotated[Tensor, Dense("B")]
+    # whether the next step is over-relaxed, in stages that over-relax
+    stretched: Annotated[Tensor, Dense("B", kind="flags")]
+    ended: Annotated[Tensor, Dense("B", kind="index")]  # status code or RUNNING
+    iterations: Annotated[Tensor, Dense("B", kind="index")]
+
+    def narrowed(
+        self, iterations: Iterations[StateT, EvaluationT], problems: Chosen
+    ) -> tuple[Iterations[StateT, EvaluationT], Progress[StateT, EvaluationT]]:
+        """The iterations of some of the problems, and their progress."""
+        at_state = iterations.evaluation_of(problems, self.at_state)
+        return iterations.of(problems), replace(self.of(problems), at_state=at_state)
+
+    def scatter(self, rows: Tensor, state: StateT, ended: Tensor, iterations: Tensor) -> tuple[StateT, Tensor, Tensor]:
+        """Best states, ends and iterations of all problems, with this batch put into its rows."""
+        return (
+            put_rows(state, rows, self.best_state),
+            ended.index_copy(0, rows, self.ended),
+            iterations.index_copy(0, rows, self.iterations),
+        )
+
+
 class Iterations(Protocol[StateT, EvaluationT]):
     """The `Iterations` of a stage evaluate B problems, which become fewer as problems end."""
 
@@ -82,6 +118,22 @@ class Iterations(Protocol[StateT, EvaluationT]):
 
     def retract(self, state: StateT, step: Tensor) -> StateT:
         """The state moved by tangent vectors (B, D) within the step limits: the only place where a state changes."""
+        ...
+
+    def all_at_once(
+        self, progress: Progress[StateT, EvaluationT], stage: StageConfig, config: SolverConfig, limits: Tensor
+    ) -> list[tuple[Tensor, Tensor]] | None:
+        """Do all iterations of a stage by native loops, and write where they end into the progress.
+
+        Args:
+            progress: of these problems where the stage begins; its evaluation is then no longer up to date.
+            stage: numbers of iterations, over-relaxation.
+            config: damping, acceptance, convergence.
+            limits: (D,) largest trusted step of each unknown.
+
+        Returns:
+            For each iteration which problems (B,) took part and their costs (B,) after it; None without such loops.
+        """
         ...
 
     def of(self, problems: Chosen) -> Self:

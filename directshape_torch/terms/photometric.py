@@ -12,14 +12,14 @@ docs/derivations/photometric.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Annotated, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from directshape_torch.config import PhotometricConfig, StageConfig
-from directshape_torch.kernels.arguments import Matching, Pixels, SurfaceArrays, Tracking, singles
+from directshape_torch.kernels.arguments import Matching, Pixels, SurfaceArrays, Tracking, Turn, singles
 from directshape_torch.kernels.choice import array, native_grid, native_rays, room_like
 from directshape_torch.numerics.gradient_mode import map_tensors, nothing_is_differentiated
 from directshape_torch.numerics.records import Dense
@@ -52,7 +52,7 @@ from directshape_torch.terms.photometric_rows import (
     warped_pixels,
 )
 from directshape_torch.terms.silhouette import sdf_state_jacobian
-from directshape_torch.terms.term import Linear, Part, Prepared, Term, part_to_write
+from directshape_torch.terms.term import Linear, NativeLoop, Prepared, Term, part_to_write
 
 Brightness = Literal["none", "gain", "affine"]
 
@@ -192,7 +192,9 @@ class Photometric(Term[Surface]):
         J = torch.where(usable[..., None], J, 0.0)
         return Linear(residual, J, J_depth_state, surface.seen(anchor, depth, usable))
 
-    def native_part(self, field: Field, state: State, anchor: Surface, fisher: bool) -> Part[Surface] | None:
+    def native_loop(
+        self, field: Field, state: State, anchor: Surface, fisher: bool, turn: Turn
+    ) -> NativeLoop[Surface] | None:
         rows = self.pixel_set.rows
         seen = rows.along_ray, rows.intensity_left, rows.pixel_weight, rows.neighbour_weight, rows.right.pixels
         grid = native_grid(field, state.T_obj_cam, rows.rays.ray_cam, anchor.points_obj, *seen)
@@ -200,17 +202,16 @@ class Photometric(Term[Surface]):
             return None
         from directshape_torch.kernels.photometric import photometric  # Numba may be missing.
 
-        config, offset = self.config, state.offset_px
         shape = *rows.pixel_weight.shape, len(rows.intensity_left)
         part, sums = part_to_write(self, state, map_tensors(room_like, anchor), shape, False)
         per_px = self.cars.inverse_depth_of_pixel
-        of_offset = (offset, offset) if per_px is None else (offset * per_px, per_px)
-        lost, corner = singles(config.lost_grey_levels, config.huber_grey_levels)
-        matching = Matching(lost, corner, array(of_offset[0]), array(of_offset[1]), CENTRE)
+        of_offset = state.offset_px, state.offset_px if per_px is None else per_px
+        norm = singles(self.config.lost_grey_levels, self.config.huber_grey_levels)
+        matching = Matching(*(*norm, *map(array, of_offset), CENTRE))
         before, now = (SurfaceArrays(*map(array, surface)) for surface in (anchor, part.anchor))
-        rays = native_rays(rows.rays, state.T_obj_cam)
-        photometric(grid, _TRACKING, matching, rays, self._pixel_arrays, before, now, sums)
-        return part
+        rays, pixels = native_rays(rows.rays, state.T_obj_cam), self._pixel_arrays
+        loop = partial(photometric, grid, _TRACKING, matching, rays, pixels, turn, before, now, sums)
+        return NativeLoop(loop, part)
 
     @cached_property
     def _pixel_arrays(self) -> Pixels:

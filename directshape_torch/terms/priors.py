@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, cast
+from functools import partial
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -18,16 +19,21 @@ from directshape_torch.config import PriorConfig
 from directshape_torch.errors import InputError, shown
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import viewing_axes
+from directshape_torch.kernels.arguments import PriorArrays, States, Turn
+from directshape_torch.kernels.choice import array, native_grid
 from directshape_torch.numerics.checks import check_alike, check_shape
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.rows import Blocks
 from directshape_torch.shape.field import Field
+from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import DimensionsDerivative, ShapePrior
 from directshape_torch.state.cars import CarBatch
 from directshape_torch.state.unknowns import CODE, OFFSET, POSE, State
 from directshape_torch.terms import robust
-from directshape_torch.terms.term import AnyTerm, Linear, NoAnchor, Term
+from directshape_torch.terms.term import AnyTerm, Linear, NativeLoop, NoAnchor, Term, part_to_write
 
+PRIORS = "shape", "height", "tilt", "dimensions", "pose", "rig"
+"""These are the names of all priors."""
 RIG_WEIGHT = 0.2
 """The offset of the disparity, in standard deviations, has the weight of the detector's pose."""
 
@@ -146,17 +152,52 @@ def prior_terms(config: PriorConfig, prior: ShapePrior, cars: CarBatch) -> list[
     return [term for term in all_terms if term.weight > 0]
 
 
-def with_joined_priors(terms: Sequence[AnyTerm]) -> tuple[AnyTerm, ...]:
+@dataclass(frozen=True)
+class JoinedPriors(PriorTerm):
+    """`JoinedPriors` are the priors of `prior_terms` in one term, whose residuals include their weights."""
+
+    config: PriorConfig = field(kw_only=True)
+    prior: ShapePrior = field(kw_only=True)
+    weights: Mapping[str, float] = field(kw_only=True)  # of the priors that take part, by their names
+
+    def native_loop(
+        self, field: Field, state: State, anchor: NoAnchor, fisher: bool, turn: Turn
+    ) -> NativeLoop[NoAnchor] | None:
+        prior, is_known = self.prior, self.weights.keys() <= set(PRIORS)
+        if not isinstance(prior, PCAShapePrior) or type(prior) is not PCAShapePrior or not is_known:
+            return None
+        if native_grid(field, state.T_obj_cam, self.cars.input_depth) is None:
+            return None
+        from directshape_torch.kernels.priors import priors  # Numba may be missing.
+
+        # Nobody reads the residuals of joined priors.
+        part, sums = part_to_write(self, state, anchor, (len(self.cars), 0, 1), False)
+        constants, states = self._constants(prior, state), States(*map(array, tuple(state)[:3]))
+        return NativeLoop(partial(priors, constants, states, turn, sums), part)
+
+    def _constants(self, prior: PCAShapePrior, state: State) -> PriorArrays:
+        cars, known = self.cars, "pose" in self.weights
+        pose_sigma = detector_pose_sigma(self.config, cars) if known else cars.detector_T_cam_obj[:, 0]
+        offset_sigma_px = state.offset_px if cars.offset_sigma_px is None else cars.offset_sigma_px[:, None]
+        of_shapes = prior.dimensions_mean_hwl, prior.dimensions_basis_hwl
+        sigma_m = constant_like(self.config.dimensions_sigma_m, state.code)
+        tensors = (cars.ground_normal_cam, cars.ground_offset, cars.detector_hwl, *of_shapes, sigma_m,
+                   cars.detector_T_cam_obj, pose_sigma, offset_sigma_px)  # fmt: skip
+        weights: list[Any] = [float(self.weights.get(name, 0.0)) for name in PRIORS]
+        return PriorArrays(*(*weights, self.config.tilt_form == "cosine", *map(array, tensors)))
+
+
+def with_joined_priors(terms: Sequence[AnyTerm], config: PriorConfig, prior: ShapePrior) -> tuple[AnyTerm, ...]:
     """The library's terms with its functions of the state joined into one, because an iteration needs only their sum.
 
     Each `PriorTerm` of the library has a Jacobian. A joined one needs fewer operations.
     """
     priors = [term for term in terms if isinstance(term, PriorTerm)]
     others = [term for term in terms if not isinstance(term, PriorTerm)]
-    return (*others, _joined(priors)) if priors else tuple(others)
+    return (*others, _joined(priors, config, prior)) if priors else tuple(others)
 
 
-def _joined(terms: Sequence[PriorTerm]) -> PriorTerm:
+def _joined(terms: Sequence[PriorTerm], config: PriorConfig, prior: ShapePrior) -> JoinedPriors:
     scales = tuple(math.sqrt(term.weight) for term in terms for _ in range(term.num_rows))
 
     def residual_of(cars: CarBatch, state: State) -> PriorResidual:
@@ -166,7 +207,10 @@ def _joined(terms: Sequence[PriorTerm]) -> PriorTerm:
         scale = constant_like(scales, residual)
         return PriorResidual(residual * scale, torch.cat(placed, dim=1) * scale[:, None])
 
-    return PriorTerm("priors", 1.0, terms[0].cars, residual_of, len(scales))
+    weights = {term.name: term.weight for term in terms}
+    return JoinedPriors(
+        "priors", 1.0, terms[0].cars, residual_of, len(scales), config=config, prior=prior, weights=weights
+    )
 
 
 def detector_pose_sigma(config: PriorConfig, cars: CarBatch) -> Tensor:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Annotated, NamedTuple, Self
 
 import torch
@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from directshape_torch.config import SilhouetteConfig, StageConfig
-from directshape_torch.kernels.arguments import ClosestArrays, Contour, singles
+from directshape_torch.kernels.arguments import ClosestArrays, Contour, Turn, singles
 from directshape_torch.kernels.choice import array, native_grid, native_rays, room_like
 from directshape_torch.numerics.gradient_mode import map_tensors, nothing_is_differentiated
 from directshape_torch.numerics.records import Dense
@@ -44,7 +44,7 @@ from directshape_torch.terms.depth import (
     sample_depths,
     tracked_closest,
 )
-from directshape_torch.terms.term import AnchorT, Linear, Part, Prepared, Term, part_to_write
+from directshape_torch.terms.term import AnchorT, Linear, NativeLoop, Prepared, Term, part_to_write
 
 # Zeta stays within these bounds, per metre.
 ZETA_BOUNDS = (4.0, 400.0)
@@ -225,7 +225,9 @@ class Silhouettes(OfMasks[Closest]):
         residual, J_residual_sdf = self._of_distance(at.value, now.crosses)
         return Linear(residual[..., None], J_residual_sdf[..., None], sdf_state_jacobian(points, gradient, at), now)
 
-    def native_part(self, field: Field, state: State, anchor: Closest, fisher: bool) -> Part[Closest] | None:
+    def native_loop(
+        self, field: Field, state: State, anchor: Closest, fisher: bool, turn: Turn
+    ) -> NativeLoop[Closest] | None:
         rays, foreground, zeta = self.rows.rays, self.rows.foreground, self.zeta
         grid = native_grid(field, self.bounds_obj, state.T_obj_cam, rays.ray_cam, foreground, zeta, anchor.points_obj)
         if grid is None or type(self) is not Silhouettes:  # A subclass may have other residuals or norms.
@@ -233,13 +235,10 @@ class Silhouettes(OfMasks[Closest]):
         from directshape_torch.kernels.silhouettes import silhouettes  # Numba may be missing.
 
         part, sums = part_to_write(self, state, map_tensors(room_like, anchor), (*foreground.shape, 1), fisher)
-        masks = map(array, (foreground, self.rows.filled, zeta))
-        contour = Contour(*(*masks, *_CONTOUR))
+        contour = Contour(*(*map(array, (foreground, self.rows.filled, zeta)), *_CONTOUR))
         before, now = (ClosestArrays(*map(array, closest)) for closest in (anchor, part.anchor))
-        silhouettes(
-            grid, native_search(self.bounds_obj), native_rays(rays, state.T_obj_cam), contour, before, now, sums
-        )
-        return part
+        search, seen = native_search(self.bounds_obj), native_rays(rays, state.T_obj_cam)
+        return NativeLoop(partial(silhouettes, grid, search, seen, contour, turn, before, now, sums), part)
 
     def residual(self, field: Field, state: State, anchor: Closest) -> Tensor:
         rays = self.rows.rays.in_objects(state.T_obj_cam)

@@ -8,7 +8,7 @@ therefore gives its Jacobian only in factors: `J_residual_state = J_residual_inn
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Generic, NamedTuple, NoReturn, Protocol, Self, TypeAlias, TypeVar
 
 import torch
@@ -17,8 +17,8 @@ from torch import Tensor
 from directshape_torch.compile import compilable
 from directshape_torch.config import StageConfig
 from directshape_torch.errors import InputError
-from directshape_torch.kernels.arguments import Sums
-from directshape_torch.kernels.choice import array
+from directshape_torch.kernels.arguments import Sums, Turn
+from directshape_torch.kernels.choice import array, every_turn
 from directshape_torch.numerics.tables import Table
 from directshape_torch.rows import Blocks, CarSums
 from directshape_torch.shape.field import Field, field_of
@@ -151,9 +151,16 @@ class Term(Table, Protocol[AnchorT]):
         """
         ...
 
+    def native_loop(
+        self, field: Field, state: State, anchor: AnchorT, fisher: bool, turn: Turn
+    ) -> NativeLoop[AnchorT] | None:
+        """A loop that does what `part_of` does for the cars whose `turn` it is; None where there is none."""
+        return None
+
     def native_part(self, field: Field, state: State, anchor: AnchorT, fisher: bool) -> Part[AnchorT] | None:
         """What `part_of` gives, by a native loop; None where none is taken."""
-        return None
+        loop = self.native_loop(field, state, anchor, fisher, every_turn(len(state.code)))
+        return None if loop is None else loop.run()
 
     def residual(self, field: Field, state: State, anchor: AnchorT) -> Tensor:
         """Differentiable residuals (M, R, N) at a state close to the one whose `linear` gave `anchor`."""
@@ -176,6 +183,17 @@ class Part(NamedTuple, Generic[AnchorT]):
     information: Tensor  # (M, D, D) the Fisher matrix, or without `fisher` the Gauss-Newton matrix
     residual: Tensor  # (M, R, N)
     anchor: AnchorT  # the points at which the residuals were taken
+
+
+class NativeLoop(NamedTuple, Generic[AnchorT]):
+    """A `NativeLoop` reads the numbers that its tensors have when it runs, and writes them into one part each time."""
+
+    loop: Callable[[], None]
+    part: Part[AnchorT]
+
+    def run(self) -> Part[AnchorT]:
+        self.loop()
+        return self.part
 
 
 def part_to_write(

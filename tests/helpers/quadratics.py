@@ -77,6 +77,9 @@ class VectorProblem:
     def step_limits(self) -> Tensor:
         return torch.full((self.num_unknowns,), self.limit, dtype=torch.float64)
 
+    def all_at_once(self, *_: object) -> None:
+        return None
+
     def evaluation_of(self, problems: Chosen, at: Energy) -> Energy:
         return take_rows(at, problems.index)
 

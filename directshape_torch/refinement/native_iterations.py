@@ -1,0 +1,119 @@
+"""This module does all iterations of a stage by native loops (`kernels.iterations`), for cars that share nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from directshape_torch.config import SolverConfig, StageConfig
+from directshape_torch.kernels.arguments import (
+    BlockSums,
+    Energies,
+    Family,
+    Iterated,
+    Iteration,
+    Rules,
+    States,
+    Steps,
+    Turn,
+)
+from directshape_torch.kernels.choice import array, native_grid
+from directshape_torch.numerics.gradient_mode import map_tensors
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.solver.damped_solve import LEAST_DIAGONAL, LEAST_PIVOT
+from directshape_torch.solver.iteration import (
+    DAMPING_DECREASE,
+    DAMPING_INCREASE,
+    FLAT,
+    LEAST_DAMPING,
+    MOST_DAMPING,
+)
+from directshape_torch.solver.problem import Progress
+from directshape_torch.state.cars import CarState
+from directshape_torch.status import Status
+from directshape_torch.terms.term import AnyTerm, Evaluation
+
+_OF_DAMPING = DAMPING_DECREASE, DAMPING_INCREASE, LEAST_DAMPING, MOST_DAMPING
+_OF_SOLVER = *_OF_DAMPING, FLAT, LEAST_DIAGONAL, LEAST_PIVOT, Status.converged.code, Status.singular.code
+
+
+def iterated(
+    prior: ShapePrior,
+    terms: Sequence[tuple[AnyTerm, object, Tensor]],
+    rest: Tensor | None,
+    progress: Progress[Any, Evaluation],
+    stage: StageConfig,
+    config: SolverConfig,
+    limits: Tensor,
+    held: Tensor,
+) -> list[tuple[Tensor, Tensor]] | None:
+    """Do the iterations and return what `solver.problem.Iterations.all_at_once` returns.
+
+    Args:
+        prior: the family of shapes.
+        terms: each with its anchor and the weights (M,) of its blocks.
+        rest: (B,) cost of rows that cannot change.
+        progress: where the stage begins; it is moved to where the stage ends.
+        stage: numbers of iterations, over-relaxation.
+        config: damping, acceptance, convergence.
+        limits: (D,) largest trusted steps, float64.
+        held: (D,) bool, which unknowns the stage fixes.
+    """
+    if type(prior) is not PCAShapePrior or type(progress.state) is not CarState or config.accept_every_step:
+        return None
+    state, candidate = (CarState(*map(_copied, progress.state)) for _ in range(2))
+    field = prior.bind(candidate.code)
+    grid = native_grid(field, candidate.T_obj_cam)
+    if grid is None:
+        return None
+    turn = Turn(array(progress.ended < 0), np.zeros(len(progress.ended), np.bool_))
+    loops, sums = [], []
+    for term, anchor, weight in terms:
+        found = term.native_loop(field, candidate, map_tensors(_copied, anchor), False, turn)
+        if found is None:
+            return None
+        loops.append(found.loop)
+        sums.append(BlockSums(*map(array, (term.blocks.owner, weight, *found.part[:2]))))
+    from directshape_torch.kernels.iterations import decide, propose  # Numba may be missing.
+
+    going = [_copied(x) for x in (progress.damping, progress.stretched, progress.ended, progress.iterations)]
+    at, at_candidate = (Energies(*(array(_copied(x)) for x in progress.at_state[:3])) for _ in range(2))
+    run = Iteration(
+        rules=_rules(stage, config, limits, held),
+        family=Family(array(prior.mean).reshape(-1), np.ascontiguousarray(grid.basis.T), grid.values),
+        rest=np.zeros_like(at.cost) if rest is None else array(rest),
+        state=States(*map(array, state)),
+        at=at,
+        progress=Iterated(*map(array, going)),
+        turn=turn,
+        steps=Steps(np.zeros_like(at.gradient), np.zeros_like(at.cost), np.zeros_like(turn.moving)),
+        candidate=States(*map(array, candidate)),
+        at_candidate=at_candidate,
+    )
+    costs = limits.new_empty(stage.max_iterations, len(turn.moving))
+    has_run = torch.zeros_like(costs, dtype=torch.bool)
+    for number in range(stage.max_iterations):
+        propose(run)
+        for loop in loops:
+            loop()
+        if not decide(run, tuple(sums), array(has_run[number]), array(costs[number])):
+            break
+    progress.state = progress.best_state = state
+    progress.damping, progress.stretched, progress.ended, progress.iterations = going
+    return list(zip(has_run[: number + 1], costs[: number + 1], strict=True))
+
+
+def _rules(stage: StageConfig, config: SolverConfig, limits: Tensor, held: Tensor) -> Rules:
+    tolerances = config.step_tolerance, config.cost_tolerance
+    changes_damping = config.initial_damping > 0
+    of_stage = float(config.max_code), float(stage.over_relaxation), *tolerances, changes_damping
+    return Rules(*(array(limits), array(held), *of_stage, *_OF_SOLVER))
+
+
+def _copied(tensor: Tensor) -> Tensor:
+    return tensor.clone(memory_format=torch.contiguous_format)

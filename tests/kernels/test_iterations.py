@@ -1,0 +1,141 @@
+"""Native iterations take the steps of the solver, and end cars as it does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+from benchmark_suites.workloads import demo_scene
+from torch import Tensor
+
+from directshape_torch import DirectShapeRefiner, load_config
+from directshape_torch.config import SolverConfig, StageConfig
+from directshape_torch.io.frame_collation import collate
+from directshape_torch.kernels.choice import without_kernels
+from directshape_torch.refinement.problem import CarIterations, CarStage
+from directshape_torch.solver.iteration import begin, iterate
+from directshape_torch.solver.problem import RUNNING, Progress
+from directshape_torch.status import Status
+
+MOST_DAMPING = 1e5
+
+
+class Begun(NamedTuple):
+    """The iterations of a stage where they begin."""
+
+    iterations: CarIterations
+    progress: Progress[Any, Any]
+    stage: StageConfig
+    config: SolverConfig
+    limits: Tensor
+
+    def natively(self, count: int = 1) -> Progress[Any, Any]:
+        progress, stage = replace(self.progress), replace(self.stage, max_iterations=count)
+        costs = self.iterations.all_at_once(progress, stage, self.config, self.limits)
+        assert costs is not None
+        assert len(costs) <= count
+        return progress
+
+    def by_tensors(self, count: int = 1) -> Progress[Any, Any]:
+        progress = replace(self.progress)
+        for _ in range(count):
+            with without_kernels():
+                iterate(self.iterations, progress, self.config, self.limits, self.stage.over_relaxation)
+        return progress
+
+
+@pytest.fixture(autouse=True)
+def _no_gradients() -> Iterator[None]:
+    with torch.no_grad():
+        yield
+
+
+def begun(*changes: str, number: int = 0, **settings: Any) -> Begun:
+    problem, state = DirectShapeRefiner(config=load_config(None, changes)).problem(*collate(demo_scene().frames))
+    stage = problem.begin(number, prepared := problem.prepare(state))
+    assert isinstance(stage, CarStage)
+    iterations, at = stage.start(prepared)
+    config = replace(problem.config.solver, **settings)
+    progress = begin(state, at, torch.full((len(state.code),), RUNNING), config)
+    return Begun(iterations, progress, stage.config, config, stage.step_limits())
+
+
+def check_same(native: Progress[Any, Any], expected: Progress[Any, Any]) -> None:
+    assert native.ended.tolist() == expected.ended.tolist()
+    assert native.iterations.tolist() == expected.iterations.tolist()
+    goes_on = expected.ended < 0
+    assert native.stretched[goes_on].tolist() == expected.stretched[goes_on].tolist()
+    torch.testing.assert_close(native.damping[goes_on], expected.damping[goes_on])
+    for found, true in zip(native.state, expected.state, strict=True):
+        torch.testing.assert_close(found, true, rtol=0, atol=2e-4)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.parametrize("changes", [[], ["rig.disparity_sigma_px=0"], ["photometric.weight=0"]])
+def test_iterations_are_those_of_the_solver(number: int, changes: list[str]) -> None:
+    """The last iterations of some cars are plain steps, refused steps or none."""
+    start = begun(*changes, number=number)
+    for count in (1, 3):
+        found = start.natively(count)
+        assert not torch.equal(found.state.T_obj_cam, start.progress.state.T_obj_cam)
+        check_same(found, start.by_tensors(count))
+
+
+def test_a_stage_that_moves_the_pose_alone() -> None:
+    stages = "stages=[{contour_width_px: 2.0, image_level: 1, max_iterations: 4, unknowns: pose}]"
+    start = begun(stages)
+    found = start.natively(2)
+    assert torch.equal(found.state.code, start.progress.state.code)
+    check_same(found, start.by_tensors(2))
+
+
+@pytest.mark.parametrize("settings", [{"cost_tolerance": 1.0}, {"step_tolerance": 1e3}, {"initial_damping": 0.0}])
+@pytest.mark.parametrize("stretched", [True, False])
+def test_cars_end_as_in_the_solver(settings: dict[str, float], stretched: bool) -> None:
+    start = begun(**settings)
+    start.progress.stretched = torch.full_like(start.progress.stretched, stretched)
+    found = start.natively()
+    check_same(found, start.by_tensors())
+    if "step_tolerance" in settings:
+        assert (found.ended == Status.converged.code).all()
+
+
+@pytest.mark.parametrize("damping", [1e-2, MOST_DAMPING])
+def test_cars_whose_system_has_no_solution(damping: float) -> None:
+    """They wait for more damping until there is no more, beside cars that go on with the same bits."""
+    start, usual = begun(), begun()
+    at = start.progress.at_state
+    for each in (start, usual):
+        each.progress.damping.fill_(damping)
+    hessian, gradient = at.hessian.clone(), at.gradient.clone()
+    hessian[0, 0, 0], hessian[1] = -1e9, torch.nan
+    gradient[2, 0] = torch.nan
+    start.progress.at_state = at._replace(hessian=hessian, gradient=gradient)
+    found, others = start.natively(), usual.natively()
+    check_same(found, start.by_tensors())
+    assert (found.ended[:3] == (Status.singular.code if damping == MOST_DAMPING else RUNNING)).all()
+    assert torch.equal(found.state.T_obj_cam[:3], start.progress.state.T_obj_cam[:3])
+    assert torch.equal(found.state.T_obj_cam[3:], others.state.T_obj_cam[3:])
+
+
+def test_a_car_that_has_ended_keeps_its_state() -> None:
+    start = begun()
+    start.progress.ended[1] = Status.converged.code
+    found = start.natively(3)
+    assert torch.equal(found.state.T_obj_cam[1], start.progress.state.T_obj_cam[1])
+    assert int(found.iterations[1]) == 0
+    check_same(found, start.by_tensors(3))
+
+
+@pytest.mark.parametrize(
+    "changes", [["solver.rays=marched"], ["solver.jacobian=autograd"], ["solver.accept_every_step=true"]]
+)
+def test_other_solvers_take_tensor_operations(changes: list[str]) -> None:
+    start = begun(*changes)
+    assert start.iterations.all_at_once(start.progress, start.stage, start.config, start.limits) is None
+    with without_kernels():
+        start = begun()
+        assert start.iterations.all_at_once(start.progress, start.stage, start.config, start.limits) is None

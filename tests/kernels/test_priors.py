@@ -1,0 +1,104 @@
+"""Native priors have the cost, gradient and matrix of tensor operations in double precision."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from benchmark_suites.workloads import demo_scene
+from helpers.single_precision import in_single
+
+from directshape_torch import DirectShapeRefiner
+from directshape_torch.io.frame_collation import collate
+from directshape_torch.kernels.choice import every_turn
+from directshape_torch.laboratory.bench import Bench
+from directshape_torch.numerics.tables import Chosen
+from directshape_torch.shape.field import field_of
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.terms.priors import JoinedPriors, PriorTerm, with_joined_priors
+from directshape_torch.terms.term import Part, in_all_columns, part_of
+
+ALL_BUT_TILT = "shape", "height", "dimensions", "pose"
+
+
+def joined(terms: list[PriorTerm], tilt_form: str, bench: Bench) -> JoinedPriors:
+    config = replace(bench.problem.config.priors, tilt_form=tilt_form)
+    (term,) = with_joined_priors(terms, config, PCAShapePrior.load_bundled())
+    assert isinstance(term, JoinedPriors)
+    return term
+
+
+def by_tensors(term: JoinedPriors, state: Any) -> Part[Any]:
+    """In double precision, of the numbers that the loop gets in single precision."""
+    field = field_of(PCAShapePrior.load_bundled().double().bind(state.code))
+    return part_of(term, in_all_columns(term, state, term.linear(field, state, ())))
+
+
+def check_same(native: Part[Any] | None, expected: Part[Any]) -> None:
+    assert native is not None
+    for found, true in zip(native[:3], expected[:3], strict=True):
+        # Products are summed up in single precision by tensor operations.
+        torch.testing.assert_close(found, true, rtol=2e-5, atol=2e-5 * float(true.abs().max()))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("tilt", ["normal", "cosine"])
+def test_priors_are_those_of_tensor_operations_in_every_regime(bench: Bench, tilt: str) -> None:
+    names = (*ALL_BUT_TILT, f"tilt_{tilt}")
+    terms = [term for name in names if isinstance(term := bench.terms[name], PriorTerm)]
+    assert len(terms) == len(names)
+    size = bench.num_unknowns
+    state = bench.moved(0.05 * torch.cos(torch.arange(size, dtype=torch.float64)))
+    single, term = in_single(state), joined(terms, tilt, bench)
+    natively = joined([in_single(each) for each in terms], tilt, bench)
+    field = field_of(PCAShapePrior.load_bundled().bind(single.code))
+    check_same(natively.native_part(field, single, (), fisher=False), by_tensors(term, state))
+
+
+@torch.no_grad()
+def test_an_unknown_offset_of_the_rig_and_cars_whose_turn_it_is() -> None:
+    problem, state = DirectShapeRefiner().problem(*collate(demo_scene().frames))
+    assert state.offset_px.shape[1] == 1
+    state = state._replace(offset_px=state.offset_px + 0.7)
+    stage = problem.begin(0, problem.prepare(state))
+    term = with_joined_priors(stage.terms, problem.config.priors, problem.prior)[-1]
+    assert isinstance(term, JoinedPriors)
+    field, turn = field_of(problem.prior.bind(state.code)), every_turn(len(state.code))
+    expected = part_of(term, in_all_columns(term, state, term.linear(field, state, ())))
+    check_same(term.native_part(field, state, (), fisher=False), expected)
+    turn.moving[1:] = False
+    loop = term.native_loop(field, state, (), False, turn)
+    assert loop is not None
+    loop.part.cost.fill_(-1.0)
+    assert (loop.run().cost[1:] == -1).all()
+    assert float(loop.part.cost[0]) > 0
+    alone = Chosen.where(torch.arange(len(state.code)) == 0)
+    own = type(state)(*(x[:1] for x in state))
+    part = term.of(alone).native_part(field_of(problem.prior.bind(own.code)), own, (), fisher=False)
+    assert part is not None
+    assert torch.equal(part.products[0], loop.part.products[0])
+
+
+def test_another_family_of_shapes_takes_tensor_operations(typical: Bench) -> None:
+    class Another(PCAShapePrior):
+        pass
+
+    another = PCAShapePrior.load_bundled()
+    another.__class__ = Another
+    (term,) = with_joined_priors([typical.terms["shape"]], typical.problem.config.priors, another)
+    single, state = in_single(term), in_single(typical.state)
+    with torch.no_grad():
+        assert single.native_part(field_of(another.bind(state.code)), state, (), fisher=False) is None
+
+
+def test_priors_that_the_loop_does_not_know_take_tensor_operations(typical: Bench) -> None:
+    known = typical.terms["shape"]
+    assert isinstance(known, PriorTerm)
+    single, state = in_single(joined([known, replace(known, name="path")], "normal", typical)), in_single(typical.state)
+    field = field_of(PCAShapePrior.load_bundled().bind(state.code))
+    with torch.no_grad():
+        assert single.native_part(field, state, (), fisher=False) is None
+        usual = in_single(joined([known], "normal", typical))
+        assert usual.native_part(field, state, (), fisher=False) is not None
