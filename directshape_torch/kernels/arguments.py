@@ -135,7 +135,6 @@ class Tracking(NamedTuple):
     near_surface_m: Real
     least_ray_cosine: Real
     least_share: Real
-    least_depth_m: Real
 
 
 class Pixels(NamedTuple):
@@ -154,14 +153,20 @@ class Pixels(NamedTuple):
     covering: Reals  # (A, 2)
 
 
-class Matching(NamedTuple):
-    """A `Matching` holds the settings of the photometric norm and what an offset of the disparity does."""
+class Comparison(NamedTuple):
+    """A `Comparison` holds the constants with which pixels are compared with the right image."""
 
     lost_grey_levels: Real
     huber_grey_levels: Real
-    offset_px: Reals  # (B, S) offset of the disparity
-    inverse_depth_per_px: Reals  # (B, S) change of the inverse depth by a pixel of offset
+    least_depth_m: Real
     centre: int  # which neighbour is the pixel itself
+
+
+class Offsets(NamedTuple):
+    """`Offsets` are those of the disparity of B cars."""
+
+    px: Reals  # (B, S)
+    inverse_depth_per_px: Reals  # (B, S) change of the inverse depth by a pixel
 
 
 class States(NamedTuple):

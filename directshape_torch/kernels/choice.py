@@ -50,12 +50,16 @@ def native_grid(field: object, *tensors: Tensor) -> arguments.Grid | None:
         field: signed distances of the cars.
         tensors: what else a loop gets, at least one tensor of each origin.
     """
-    # A subclass of the shape may look up anew. No tensor is fit while the user's own compiler looks.
-    if type(field) is not GridShape or not nothing_is_differentiated():
-        return None
-    if not all(map(_is_fit, (field.values, field.basis, *tensors))):
-        return None
-    return _grid(field) if _is_on.get() and _is_installed() else None
+    # A subclass of the shape may look up anew.
+    is_grid = type(field) is GridShape and takes_loops(field.values, field.basis, *tensors)
+    return _grid(field) if isinstance(field, GridShape) and is_grid else None
+
+
+def takes_loops(*tensors: Tensor) -> bool:
+    """Whether native loops take tensors like these at this place of the program."""
+    # No tensor is fit while the user's own compiler looks.
+    is_fit = nothing_is_differentiated() and all(map(_is_fit, tensors))
+    return is_fit and _is_on.get() and _is_installed()
 
 
 def _is_fit(tensor: Tensor) -> bool:

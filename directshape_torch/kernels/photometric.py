@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from directshape_torch.kernels.arguments import (
+    Comparison,
     Flags,
     Grid,
     Index,
-    Matching,
+    Offsets,
     Pixels,
     Point,
     Points,
@@ -80,7 +81,8 @@ def compared_for(num_neighbours: int, num_rows: int) -> Compared:
 def photometric(
     grid: Grid,
     tracking: Tracking,
-    matching: Matching,
+    comparison: Comparison,
+    offsets: Offsets,
     rays: Rays,
     pixels: Pixels,
     turn: Turn,
@@ -90,7 +92,7 @@ def photometric(
     _sources: int = SOURCES,
 ) -> None:
     """Write the sums of blocks and the surface under their pixels, which is tracked from that of a nearby state."""
-    num_rows, num_offsets = rays.ray_cam.shape[2], matching.offset_px.shape[1]
+    num_rows, num_offsets = rays.ray_cam.shape[2], offsets.px.shape[1]
     num_shape = 6 + grid.basis.shape[1]
     J = np.zeros((num_rows, num_shape + num_offsets), np.float32)
     weighted = np.empty((num_rows, J.shape[1] + 1), np.float32)
@@ -110,12 +112,12 @@ def photometric(
         write_where(now.on_surface[number], block, found, last, of_block(now.points_obj, number))
         write_gradient_where(now.on_surface[number], found, normal, of_block(now.normal_obj, number))
         if num_offsets:
-            write_offset(tracking, matching, car, depth, found.depth_per_sdf, J[:, num_shape])
+            write_offset(tracking, offsets, car, depth, found.depth_per_sdf, J[:, num_shape])
         for row in range(np.uint64(num_rows)):
             usable[row] = now.on_surface[number, row]
-        compare(pixels, tracking, number, depth, patches, compared, usable)
-        drop_hidden(pixels, number, np.uint64(matching.centre), depth, patches, usable)
-        add_neighbours(pixels, matching, number, usable, compared)
+        compare(pixels, comparison, number, depth, patches, compared, usable)
+        drop_hidden(pixels, number, np.uint64(comparison.centre), depth, patches, usable)
+        add_neighbours(pixels, comparison, number, usable, compared)
         cost = 0.0
         for row in range(np.uint64(num_rows)):
             cost += compared.cost[row]
@@ -198,11 +200,11 @@ def write_gradient_where(on_surface: Flags, found: Found, last: Points, gradient
 
 @step
 def write_offset(
-    tracking: Tracking, matching: Matching, car: Index, depth: Reals, depth_per_sdf: Reals, J: Reals
+    tracking: Tracking, offsets: Offsets, car: Index, depth: Reals, depth_per_sdf: Reals, J: Reals
 ) -> None:
     """Move the depths by the offset of the disparity, and write the derivative by it."""
-    per_px = matching.inverse_depth_per_px[car, 0]
-    inverse_depth = matching.offset_px[car, 0] * per_px
+    per_px = offsets.inverse_depth_per_px[car, 0]
+    inverse_depth = offsets.px[car, 0] * per_px
     for row in range(np.uint64(len(depth))):
         ratio = ONE + depth[row] * inverse_depth
         # A point whose disparity would vanish is moved behind the camera, where it is lost.
@@ -214,7 +216,7 @@ def write_offset(
 @step
 def compare(
     pixels: Pixels,
-    tracking: Tracking,
+    comparison: Comparison,
     number: Index,
     depth: Reals,
     patches: Patches,
@@ -231,18 +233,18 @@ def compare(
             ray = rays[0, n, number, row], rays[1, n, number, row], rays[2, n, number, row]
             compared.residual[n, row] = value - left[n, number, row]
             compared.slope[n, row] = (slope_u * (ray[0] - ray[2] * u) + slope_v * (ray[1] - ray[2] * v)) * (ONE / z)
-            usable[row] &= inside & (z > tracking.least_depth_m)
+            usable[row] &= inside & (z > comparison.least_depth_m)
 
 
 @step
-def add_neighbours(pixels: Pixels, matching: Matching, number: Index, usable: Flags, compared: Compared) -> None:
+def add_neighbours(pixels: Pixels, comparison: Comparison, number: Index, usable: Flags, compared: Compared) -> None:
     """Write costs in Huber's norm, and the weights of the rows in gradient and matrix; lost pixels have no slope."""
     cost, first, second = compared.cost, compared.gradient_weight, compared.hessian_weight
     cost[:], first[:], second[:] = ZERO, ZERO, ZERO
-    corner, of_pixel = matching.huber_grey_levels, pixels.pixel_weight[number]
+    corner, of_pixel = comparison.huber_grey_levels, pixels.pixel_weight[number]
     for n in range(np.uint64(len(compared.residual))):
         for row in range(np.uint64(len(cost))):
-            residual = compared.residual[n, row] if usable[row] else matching.lost_grey_levels
+            residual = compared.residual[n, row] if usable[row] else comparison.lost_grey_levels
             slope = compared.slope[n, row] if usable[row] else ZERO
             size, weight = abs(residual), of_pixel[row] * pixels.neighbour_weight[n, number, row]
             inner = min(size, corner)

@@ -8,7 +8,7 @@ moved along their rays together, as if the whole visible surface had another dis
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,12 +16,13 @@ from torch import Tensor
 from directshape_torch.compile import compilable
 from directshape_torch.config import PhotometricConfig
 from directshape_torch.errors import InputError
+from directshape_torch.kernels.choice import array, takes_loops
 from directshape_torch.numerics.records import CarRecord, Dense
 from directshape_torch.numerics.tables import take_rows
 from directshape_torch.numerics.tensors import made_once
 from directshape_torch.rows import CarSums, Rays
 from directshape_torch.terms.photometric import Photometric, Surface
-from directshape_torch.terms.photometric_rows import PhotometricRows, residuals_at
+from directshape_torch.terms.photometric_rows import PhotometricRows, comparison, pixel_arrays, residuals_at
 from directshape_torch.terms.robust import huber
 
 # Two minima nearer to each other than this count as one minimum with a dent.
@@ -194,17 +195,7 @@ def disparity_profile(
         for x, y in ((before.depth, after.depth), (before.on_surface, after.on_surface))
     )
     per_px = -1 / (term.cars.K_right[:, 0, 0] * term.cars.T_right_cam[:, 0, 3])
-    # If there are many pixels, the offsets are evaluated in parts, so that this needs no more memory than other
-    # evaluations.
-    num_parts = -(-rows.neighbour_weight.numel() * 2 * len(offsets) // _RESIDUALS_AT_ONCE)
-    parts = _quarters(rows)
-    quarters = torch.cat(
-        [
-            shifted_costs(rows, term.config, parts, depth, on_surface, per_px, some)
-            for some in offsets.to(depth).tensor_split(num_parts)
-        ],
-        dim=2,
-    )
+    quarters = shifted_costs(rows, term.config, _quarters(rows), depth, on_surface, per_px, offsets.to(depth))
     weight = (rows.neighbour_weight.sum(dim=0) * (rows.pixel_weight > 0)).sum(dim=1, dtype=torch.float64)
     num_pixels = (rows.pixel_weight > 0).sum(dim=1)
     means = (term.config.weight * cost.mT / weight.clamp_min(1)[:, None] for cost in quarters.sum(dim=0))
@@ -261,7 +252,6 @@ def _thinned(term: Photometric, max_pixels: int) -> tuple[PhotometricRows, Tenso
     return PhotometricRows(rays, along_ray, along_baseline, left, weight, neighbours, right), place
 
 
-@compilable
 def shifted_costs(
     rows: PhotometricRows,
     config: PhotometricConfig,
@@ -272,6 +262,34 @@ def shifted_costs(
     offsets_px: Tensor,  # (n,)
 ) -> Tensor:
     """Costs (Q, S, n, B), float64, of Q parts of the pixels of each car, with S surfaces moved by n disparities."""
+    if takes_loops(parts, depth, per_px, rows.along_ray, rows.intensity_left, rows.right.pixels):
+        from directshape_torch.kernels.shifts import shifted  # Numba may be missing.
+
+        shape = len(parts), len(depth), len(offsets_px), len(per_px)
+        costs = torch.empty(shape, dtype=torch.float64, device=depth.device)
+        tensors: list[Any] = [array(x) for x in (parts, depth, on_surface, per_px, offsets_px, costs)]
+        shifted(pixel_arrays(rows), comparison(config), *tensors)
+        return costs
+    # If there are many pixels, the offsets are evaluated in parts, so that this needs no more memory than other
+    # evaluations.
+    num_parts = max(1, -(-rows.neighbour_weight.numel() * len(depth) * len(offsets_px) // _RESIDUALS_AT_ONCE))
+    some = (
+        _shifted_costs(rows, config, parts, depth, on_surface, per_px, of_part)
+        for of_part in offsets_px.tensor_split(num_parts)
+    )
+    return torch.cat(list(some), dim=2)
+
+
+@compilable
+def _shifted_costs(
+    rows: PhotometricRows,
+    config: PhotometricConfig,
+    parts: Tensor,
+    depth: Tensor,
+    on_surface: Tensor,
+    per_px: Tensor,
+    offsets_px: Tensor,
+) -> Tensor:
     inverse = 1 / depth[:, None] + offsets_px[:, None, None] * per_px[:, None]
     residual, comparable = residuals_at(rows, 1 / inverse)
     usable = on_surface[:, None] & comparable & (inverse > 0)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import rotation_y_from_pose, viewing_axes
+from directshape_torch.kernels.choice import array, takes_loops
 from directshape_torch.numerics.records import CarRecord, Dense
 from directshape_torch.refinement.observability import HEADING_LEVER_M, quantities_jacobian
 from directshape_torch.refinement.trust import ImageNoise, probabilities
@@ -80,11 +81,22 @@ def level_boxes(
     code: Tensor,  # (B, K)
 ) -> tuple[Tensor, Tensor]:  # (B, 3), (B, 3)
     """Bottom centres of the boxes around zero levels, in the target frame of `T`, and height, width, length."""
-    lower, upper = zero_level_extents(prior.values(code), prior.origin, prior.spacing_m).unbind(1)
+    lower, upper = _extents(prior, code).unbind(1)
     length, height, width = (upper - lower).unbind(-1)
     middle = 0.5 * (lower + upper)
     bottom_obj = torch.stack([middle[:, 0], upper[:, 1], middle[:, 2]], dim=-1)
     return se3.transform(T, bottom_obj), torch.stack([height, width, length], dim=-1)
+
+
+def _extents(prior: ShapePrior, code: Tensor) -> Tensor:
+    values = prior.values(code)
+    if not takes_loops(values):
+        return zero_level_extents(values, prior.origin, prior.spacing_m)
+    from directshape_torch.kernels.extents import extents  # Numba may be missing.
+
+    nodes = values.new_empty(len(values), 3, 2)
+    extents(array(values), array(nodes))
+    return prior.origin + prior.spacing_m * nodes.mT
 
 
 @torch.no_grad()

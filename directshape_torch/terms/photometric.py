@@ -12,14 +12,14 @@ docs/derivations/photometric.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import Annotated, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from directshape_torch.config import PhotometricConfig, StageConfig
-from directshape_torch.kernels.arguments import Matching, Pixels, SurfaceArrays, Tracking, Turn, singles
+from directshape_torch.kernels.arguments import Offsets, SurfaceArrays, Tracking, Turn, singles
 from directshape_torch.kernels.choice import array, native_grid, native_rays, room_like
 from directshape_torch.numerics.gradient_mode import map_tensors, nothing_is_differentiated
 from directshape_torch.numerics.records import Dense
@@ -43,11 +43,11 @@ from directshape_torch.terms.depth import (
     tracked_depth,
 )
 from directshape_torch.terms.photometric_rows import (
-    CENTRE,
-    LEAST_DEPTH_M,
     LeftPixels,
     PhotometricRows,
     compared,
+    comparison,
+    pixel_arrays,
     residuals_at,
     warped_pixels,
 )
@@ -66,7 +66,7 @@ _LEAST_RAY_COSINE = 0.1
 _LEAST_SHARE = 1e-3
 # These are the constants of native rows.
 _OF_TRACKING = MAX_STEP_M, LEAST_STEP_M, FLATTEST_SHARE, LEAST_SLOPE, NEAR_SURFACE_M
-_TRACKING = Tracking(SECANTS, *singles(*_OF_TRACKING, _LEAST_RAY_COSINE, _LEAST_SHARE, LEAST_DEPTH_M))
+_TRACKING = Tracking(SECANTS, *singles(*_OF_TRACKING, _LEAST_RAY_COSINE, _LEAST_SHARE))
 
 
 class PixelSet(NamedTuple):
@@ -206,17 +206,11 @@ class Photometric(Term[Surface]):
         part, sums = part_to_write(self, state, map_tensors(room_like, anchor), shape, False)
         per_px = self.cars.inverse_depth_of_pixel
         of_offset = state.offset_px, state.offset_px if per_px is None else per_px
-        norm = singles(self.config.lost_grey_levels, self.config.huber_grey_levels)
-        matching = Matching(*(*norm, *map(array, of_offset), CENTRE))
         before, now = (SurfaceArrays(*map(array, surface)) for surface in (anchor, part.anchor))
-        rays, pixels = native_rays(rows.rays, state.T_obj_cam), self._pixel_arrays
-        loop = partial(photometric, grid, _TRACKING, matching, rays, pixels, turn, before, now, sums)
+        rays, offsets = native_rays(rows.rays, state.T_obj_cam), Offsets(*map(array, of_offset))
+        of_pixels = offsets, rays, pixel_arrays(rows), turn
+        loop = partial(photometric, grid, _TRACKING, comparison(self.config), *of_pixels, before, now, sums)
         return NativeLoop(loop, part)
-
-    @cached_property
-    def _pixel_arrays(self) -> Pixels:
-        rows = self.pixel_set.rows
-        return Pixels(*map(array, (*rows[1:-1], *rows.right)))
 
     def residual(self, field: Field, state: State, anchor: Surface) -> Tensor:
         rows = self.pixel_set.rows

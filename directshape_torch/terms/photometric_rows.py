@@ -15,6 +15,8 @@ from torch import Tensor
 from directshape_torch.config import PhotometricConfig
 from directshape_torch.image.grey_levels import GreyPair
 from directshape_torch.image.interpolate import BilinearPatch, bilinear_patch
+from directshape_torch.kernels.arguments import Comparison, Pixels, singles
+from directshape_torch.kernels.choice import array
 from directshape_torch.numerics.records import Dense
 from directshape_torch.numerics.tables import Table
 from directshape_torch.numerics.tensors import all_along, made_once
@@ -185,6 +187,16 @@ def residuals_at(rows: PhotometricRows, depth: Tensor) -> tuple[Tensor, Tensor]:
     """Differentiable residuals (..., M, 64, N) at depths (..., M, 64), and a mask (..., M, 64) of comparable pixels."""
     warped = warped_pixels(rows, depth)
     return warped.residual(rows), warped.is_comparable(rows.right)
+
+
+def comparison(config: PhotometricConfig) -> Comparison:
+    """The constants of native loops."""
+    return Comparison(*(*singles(config.lost_grey_levels, config.huber_grey_levels, LEAST_DEPTH_M), CENTRE))
+
+
+def pixel_arrays(rows: PhotometricRows) -> Pixels:
+    """The pixels for native loops."""
+    return Pixels(*map(array, (*rows[1:-1], *rows.right)))
 
 
 class Warped(NamedTuple):
