@@ -204,9 +204,14 @@ class DirectShapeRefiner(nn.Module):
         failure = refusals(everyone, seen, self.config)
         usable = Chosen.where(failure < 0 if chosen is None else (failure < 0) & chosen)
         rows, cars = usable.index, everyone.of(usable)
-        problem = problem_of_scene(
-            self.config, self.prior, frames, detections, cars, seen.of(usable), self.extra_terms, term_weights
-        )
+        seen = seen.of(usable)
+
+        def make_problem(cars: CarBatch, seen: Observation) -> CarProblem:
+            return problem_of_scene(
+                self.config, self.prior, frames, detections, cars, seen, self.extra_terms, term_weights
+            )
+
+        problem = make_problem(cars, seen)
         unrefined = unrefined_result(self.prior, frames, detections, failure, problem.term_names)
         if not len(rows):
             return unrefined, everyone
@@ -220,7 +225,7 @@ class DirectShapeRefiner(nn.Module):
             from directshape_torch.refinement.candidates import refined_from_candidates
 
             own = others.index_select(0, rows)
-            found, T_cam_obj = refined_from_candidates(problem, cars, initial, own, beforehand)
+            found, T_cam_obj = refined_from_candidates(make_problem, cars, seen, initial, own, beforehand)
             T_cam_obj = everyone.detector_T_cam_obj.index_copy(0, rows, T_cam_obj)
             everyone = replace(everyone, detector_T_cam_obj=T_cam_obj)
         result = found if is_all else replace(unrefined.put(rows, found), term_names=found.term_names)

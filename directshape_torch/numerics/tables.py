@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -84,6 +84,41 @@ def take_rows(value: _T, index: Tensor, axis: str = "B") -> _T:
         return part.index_select(spec.shape.index(axis), index) if axis in spec.shape else part
 
     return _changed(value, taken, lambda part: take_rows(part, index, axis)) if is_table(value) else value
+
+
+def joined(tables: Sequence[_T], num_cars: Sequence[int]) -> _T:
+    """One table of the cars of several tables, first those of the first one, with what all cars share there.
+
+    Args:
+        tables: tables of the same kind, in which nothing numbers rows other than cars.
+        num_cars: number of cars of each table.
+    """
+    first_car = [sum(num_cars[:number]) for number in range(len(num_cars))]
+
+    def join(parts: Sequence[Any]) -> Any:
+        if isinstance(parts[0], tuple):
+            return inside(parts)
+        return joined(parts, num_cars) if is_table(parts[0]) else parts[0]
+
+    def inside(parts: Sequence[Any]) -> Any:
+        """The first of the parts, with what all have in each of its fields."""
+        if type(parts[0]) is tuple:
+            return tuple(map(join, zip(*parts, strict=True)))
+        names = (name for name in declared(parts[0]) if getattr(parts[0], name) is not None)
+        others = iter([[getattr(part, name) for part in parts] for name in names])
+        return _changed(parts[0], lambda _, spec: declared_field(next(others), spec), lambda _: join(next(others)))
+
+    def declared_field(values: list[Any], spec: Dense) -> Any:
+        if isinstance(values[0], tuple):
+            return sum(values, ())
+        assert spec.numbers_of in ("", "B"), "rows other than cars are numbered"
+        if spec.numbers_of:
+            values = [value + first for value, first in zip(values, first_car, strict=True)]
+        of_cars = (axis for axis, letter in enumerate(spec.shape) if letter == "B" or _owner(tables[0], str(letter)))
+        axis = next(of_cars, None)
+        return values[0] if axis is None else torch.cat(values, dim=axis)
+
+    return cast(_T, inside(tables))
 
 
 def is_table(value: object) -> bool:

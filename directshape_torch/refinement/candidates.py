@@ -8,15 +8,15 @@ rather in which local minimum the depth ended (docs/no_boxes.md). The choice amo
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from directshape_torch.geometry import se3
-from directshape_torch.numerics.tables import Chosen, take_rows
+from directshape_torch.numerics.tables import Chosen, joined, take_rows
+from directshape_torch.observation.packing import Observation
 from directshape_torch.observation.refinable import stands_in_view
 from directshape_torch.refinement.make_result import at_states
 from directshape_torch.refinement.problem import CarProblem
@@ -37,8 +37,9 @@ _OPPOSITE_COSINE = -0.5
 
 
 def refined_from_candidates(
-    problem: CarProblem,
+    make_problem: Callable[[CarBatch, Observation], CarProblem],
     cars: CarBatch,
+    seen: Observation,
     initial: CarState,
     other_T_cam_obj: Tensor,  # (B, C, 4, 4), NaN where a car has fewer
     unrefined: RefinementResult,
@@ -46,81 +47,67 @@ def refined_from_candidates(
     """The results of B cars from the best of their poses, and these poses (B, 4, 4).
 
     The result of the lowest cost is the best one; a result that is refused is worse than any that is not.
+
+    Args:
+        make_problem: makes the problem of some cars of what the images show of them.
+        cars: the B cars.
+        seen: what the images show of the cars.
+        initial: input states.
+        other_T_cam_obj: poses besides the input's.
+        unrefined: what is known of the cars before the minimisation.
     """
     T_cam_obj = torch.cat([cars.detector_T_cam_obj[:, None], other_T_cam_obj], dim=1)
     in_view = torch.stack([stands_in_view(T, cars.ground_normal_cam) for T in T_cam_obj.unbind(dim=1)], dim=1)
-    T_cam_obj, in_view = (each[:, in_view.any(dim=0)] for each in (T_cam_obj, in_view))
-    tries = [
-        _Try.of(problem, cars, initial, T_start, Chosen.where(has_start), unrefined)
-        for T_start, has_start in zip(T_cam_obj.unbind(dim=1), in_view.unbind(dim=1), strict=True)
-    ]
-    cost, forward, refused = (torch.stack(column, dim=1) for column in zip(*map(_Try.of_all, tries), strict=True))
-    only_refused = refused.all(dim=1, keepdim=True)
-    best = cost.masked_fill(refused & ~only_refused, torch.inf).argmin(dim=1)
+    some = [Chosen.where(column) for column in in_view.unbind(dim=1)]
+    # All poses of all cars are refined at once, number by number.
+    car, place = torch.cat([each.index for each in some]), in_view.T.flatten().nonzero()[:, 0]
+    counts, starts = [len(each.numbers) for each in some], T_cam_obj.transpose(0, 1).flatten(0, 1)[place]
+    # The box that a result is compared and combined with is the one that it began at.
+    own = replace(joined([cars.of(each) for each in some], counts), detector_T_cam_obj=starts)
+    problem = make_problem(own, joined([seen.of(each) for each in some], counts))
+    inputs = take_rows(initial, car)
+    start = inputs._replace(T_obj_cam=se3.inverse(starts))
+    tried = Refined.of(problem, own, inputs, start, unrefined.rows(car))
+    cost, forward, refused = _of_all(tried, place, in_view.T)
+    best = cost.masked_fill(refused & ~refused.all(dim=1, keepdim=True), torch.inf).argmin(dim=1)
     sense = probability_of_sense(cost, forward, best)
-    width = max(each.refined.found.cost_history.shape[1] for each in tries)
-    result = tries[0].result(best == 0, sense, width)
-    for number, each in enumerate(tries[1:], 1):
-        rows = each.chosen.index
-        is_best = best[rows] == number
-        own = each.result(is_best, sense[rows], width).rows(is_best.nonzero()[:, 0])
-        result = result.put(rows[is_best], own)
-    return result, T_cam_obj.gather(1, best[:, None, None, None].expand(-1, 1, 4, 4))[:, 0]
+    is_best = best[car] == place // len(in_view)
+    return _best(tried, start, is_best, car, sense), T_cam_obj[torch.arange(len(best), device=best.device), best]
 
 
-class _Try(NamedTuple):
-    """A `_Try` is the refinement of those of B cars that have a pose of one number."""
+def _of_all(tried: Refined[CarState], place: Tensor, in_view: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Costs (B, C), directions of the front in the camera's frame (B, C, 3), and whether results are refused (B, C).
 
-    chosen: Chosen  # the R cars that have the pose
-    start: CarState  # where their iterations begin
-    refined: Refined[CarState]
+    The results stand at some places (R,) of the table `in_view` (C, B); the cost is infinite where there is none.
+    """
+    minimum, names = tried.minimum, tried.problem.term_names
+    left_out = torch.tensor([name in PhotometricEvidence.names for name in names], device=place.device)
+    cost = minimum.after.term_costs.masked_fill(left_out, 0.0).sum(dim=1)
+    cost = cost.masked_fill(cost.isnan(), torch.inf)
+    # The first row of R_obj_cam is the object's x axis in the camera's frame.
+    columns = (cost, torch.inf), (minimum.end.T_obj_cam[:, 0, :3], 0.0), (~is_refined(minimum.status), True)
+    cost, forward, refused = (
+        values.new_full((in_view.numel(), *values.shape[1:]), nothing).index_copy(0, place, values)
+        for values, nothing in columns
+    )
+    shape = in_view.shape
+    return cost.view(shape).T, forward.view(*shape, 3).transpose(0, 1), refused.view(shape).T
 
-    @classmethod
-    def of(
-        cls,
-        problem: CarProblem,
-        cars: CarBatch,
-        initial: CarState,
-        T_cam_obj: Tensor,
-        chosen: Chosen,
-        unrefined: RefinementResult,
-    ) -> _Try:
-        rows = chosen.index
-        # The box that a result is compared and combined with is the one that it began at.
-        own = replace(cars, detector_T_cam_obj=T_cam_obj).of(chosen)
-        inputs = take_rows(initial, rows)
-        start = inputs._replace(T_obj_cam=se3.inverse(T_cam_obj.index_select(0, rows)))
-        return cls(chosen, start, Refined.of(problem.of(chosen), own, inputs, start, unrefined.rows(rows)))
 
-    def of_all(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Cost (B,), direction of the front in the camera's frame (B, 3) and whether the result is refused (B,).
+def _best(tried: Refined[CarState], start: CarState, is_best: Tensor, car: Tensor, sense: Tensor) -> RefinementResult:
+    """The result of each car from its best pose, with the graph of the backward mode.
 
-        The cost is infinite where there is none.
-        """
-        minimum, names = self.refined.minimum, self.refined.problem.term_names
-        left_out = torch.tensor([name in PhotometricEvidence.names for name in names], device=self.chosen.keep.device)
-        cost = minimum.after.term_costs.masked_fill(left_out, 0.0).sum(dim=1)
-        cost = cost.masked_fill(cost.isnan(), torch.inf)
-        of_all = cost.new_full(self.chosen.keep.shape, torch.inf).index_copy(0, self.chosen.index, cost)
-        # The first row of R_obj_cam is the object's x axis in the camera's frame.
-        x_axis = minimum.end.T_obj_cam[:, 0, :3]
-        forward = x_axis.new_zeros(len(of_all), 3).index_copy(0, self.chosen.index, x_axis)
-        refused = torch.ones_like(self.chosen.keep).index_copy(0, self.chosen.index, ~is_refined(minimum.status))
-        return of_all, forward, refused
-
-    def result(self, is_best: Tensor, sense: Tensor, width: int) -> RefinementResult:
-        """The result (R,), with the graph of the backward mode for the cars that end here.
-
-        Args:
-            is_best: (R,) bool, the cars that end here.
-            sense: (R,) probabilities of the sense of their headings.
-            width: number of iterations of the cost history.
-        """
-        found, status = self.refined.found, self.refined.minimum.status
-        history = pad(found.cost_history, (0, width - found.cost_history.shape[1]), value=torch.nan)
-        quality = replace(found.quality, probability_heading=sense)
-        found = replace(found, cost_history=history, quality=quality)
-        return at_states(found, self.refined.states(self.start, is_refined(status) & is_best))
+    Args:
+        tried: the R results.
+        start: where they began.
+        is_best: (R,) bool, the best result of each car.
+        car: (R,) the car of each result.
+        sense: (B,) probabilities of the sense of the headings.
+    """
+    states = tried.states(start, is_refined(tried.minimum.status) & is_best)
+    rows = is_best.nonzero()[:, 0]
+    best = at_states(tried.found, states).rows(rows[car[rows].argsort()])
+    return replace(best, quality=replace(best.quality, probability_heading=sense))
 
 
 def probability_of_sense(

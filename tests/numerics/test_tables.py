@@ -12,7 +12,7 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.records import Dense, declared
-from directshape_torch.numerics.tables import Chosen, Table, of, take_rows
+from directshape_torch.numerics.tables import Chosen, Table, joined, of, take_rows
 from directshape_torch.rows import Blocks, PixelSamples, Rows
 
 CARS = Chosen(torch.tensor([False, True, False, True]), [1, 3])
@@ -60,6 +60,20 @@ def test_no_car_leaves_tables_without_rows() -> None:
     none = table().of(Chosen(torch.zeros(4, dtype=torch.bool), []))
     assert none.inner.points.shape == (3, 0, 2)
     assert none.blocks.counts == ()
+
+
+def test_tables_are_joined_car_after_car() -> None:
+    whole = table()
+    parts = [whole.of(CARS), whole.of(Chosen.where(torch.tensor([True, True, False, False])))]
+    both = joined(parts, [2, 2])
+    assert both.blocks.owner.tolist() == [1, 0, 1, 3, 2]
+    assert both.blocks.counts == (1, 2, 1, 1)
+    assert both.counts == (6, 8, 5, 6)
+    assert both.offset is None
+    for part, before in zip((both.inner, *both.several), (whole.inner, *whole.several), strict=True):
+        assert torch.equal(part.points, before.points[:, [0, 1, 3, 1, 2]])
+    assert both.bounds is whole.bounds
+    assert joined([whole], [4]).blocks.owner.tolist() == BLOCKS.owner.tolist()
 
 
 @dataclass(frozen=True)
