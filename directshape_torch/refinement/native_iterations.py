@@ -85,7 +85,7 @@ def iterated(
     at, at_candidate = (Energies(*(array(_copied(x)) for x in progress.at_state[:3])) for _ in range(2))
     run = Iteration(
         rules=_rules(stage, config, limits, held),
-        family=Family(array(prior.mean).reshape(-1), np.ascontiguousarray(grid.basis.T), grid.values),
+        family=Family(array(prior.mean).reshape(-1), array(prior.basis.flatten(0, 2).T), grid.values),
         rest=np.zeros_like(at.cost) if rest is None else array(rest),
         state=States(*map(array, state)),
         at=at,

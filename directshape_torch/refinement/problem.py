@@ -179,8 +179,7 @@ class CarStage:
         if self.problem.factors is not None:
             return self.terms
         own = len(self.problem.evidence)
-        joined = with_joined_priors(self.terms[:own], self.problem.config.priors, self.problem.prior)
-        return (*joined, *self.terms[own:])
+        return (*with_joined_priors(self.terms[:own]), *self.terms[own:])
 
     def linearise_differentiably(self, state: State) -> Evaluation:
         """The hand-derived linearisation with an autograd graph to state, images, masks, prior and weights."""

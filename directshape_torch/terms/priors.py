@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple, cast
 
@@ -123,54 +123,25 @@ class PriorTerm(Term[NoAnchor]):
         return robust.quadratic(residual)
 
 
-def prior_terms(config: PriorConfig, prior: ShapePrior, cars: CarBatch) -> list[PriorTerm]:
-    """Priors of shape, height, tilt, dimensions, pose where its sigma is known, and rig where an offset is unknown."""
-
-    def of_shape(_: CarBatch, state: State) -> PriorResidual:
-        return shape_prior(state.code)
-
-    def of_dimensions(cars: CarBatch, state: State) -> PriorResidual:
-        sigma = constant_like(config.dimensions_sigma_m, state.code)
-        return dimensions_prior(prior.dimensions_and_derivative(state.code), cars.detector_hwl, sigma)
-
-    def of_pose(cars: CarBatch, state: State) -> PriorResidual:
-        sigma = detector_pose_sigma(config, cars)
-        return pose_prior(state.T_obj_cam, cars.detector_T_cam_obj, sigma)
-
-    tilt, num_tilts = (tilt_prior_normal, 2) if config.tilt_form == "normal" else (tilt_prior_cosine, 1)
-    all_terms = [
-        PriorTerm("shape", config.shape_weight, cars, of_shape, prior.num_codes, (CODE,)),
-        PriorTerm("height", config.height_weight, cars, height_prior, 1, (POSE,)),
-        PriorTerm("tilt", config.tilt_weight, cars, tilt, num_tilts, (POSE,)),
-        PriorTerm("dimensions", config.dimensions_weight, cars, of_dimensions, 3, (CODE,)),
-    ]
-    if cars.detector_pose_sigma is not None or any(config.pose_sigmas):
-        all_terms.append(PriorTerm("pose", config.pose_weight, cars, of_pose, 4, (POSE,)))
-    if cars.num_offsets:
-        # This prior belongs to the measurements, because it limits how well the images measure a car.
-        all_terms.append(PriorTerm("rig", RIG_WEIGHT, cars, rig_prior, 1, (OFFSET,), is_prior=False))
-    return [term for term in all_terms if term.weight > 0]
-
-
 @dataclass(frozen=True)
-class JoinedPriors(PriorTerm):
-    """`JoinedPriors` are the priors of `prior_terms` in one term, whose residuals include their weights."""
+class CarPrior(PriorTerm):
+    """A `CarPrior` is a prior of `prior_terms`, or several of them in one term, whose residuals include weights."""
 
     config: PriorConfig = field(kw_only=True)
     prior: ShapePrior = field(kw_only=True)
-    weights: Mapping[str, float] = field(kw_only=True)  # of the priors that take part, by their names
+    weights: Mapping[str, float] = field(kw_only=True)  # in the residuals, by the names of the priors
 
     def native_loop(
         self, field: Field, state: State, anchor: NoAnchor, fisher: bool, turn: Turn
     ) -> NativeLoop[NoAnchor] | None:
-        prior, is_known = self.prior, self.weights.keys() <= set(PRIORS)
-        if not isinstance(prior, PCAShapePrior) or type(prior) is not PCAShapePrior or not is_known:
+        prior = self.prior
+        if not isinstance(prior, PCAShapePrior) or type(prior) is not PCAShapePrior:
             return None
         if native_grid(field, state.T_obj_cam, self.cars.input_depth) is None:
             return None
         from directshape_torch.kernels.priors import priors  # Numba may be missing.
 
-        # Nobody reads the residuals of joined priors.
+        # Nobody reads the residuals of priors.
         part, sums = part_to_write(self, state, anchor, (len(self.cars), 0, 1), False)
         constants, states = self._constants(prior, state), States(*map(array, tuple(state)[:3]))
         return NativeLoop(partial(priors, constants, states, turn, sums), part)
@@ -187,17 +158,64 @@ class JoinedPriors(PriorTerm):
         return PriorArrays(*(*weights, self.config.tilt_form == "cosine", *map(array, tensors)))
 
 
-def with_joined_priors(terms: Sequence[AnyTerm], config: PriorConfig, prior: ShapePrior) -> tuple[AnyTerm, ...]:
-    """The library's terms with its functions of the state joined into one, because an iteration needs only their sum.
+def prior_terms(config: PriorConfig, prior: ShapePrior, cars: CarBatch) -> list[PriorTerm]:
+    """Priors of shape, height, tilt, dimensions, pose where its sigma is known, and rig where an offset is unknown."""
 
-    Each `PriorTerm` of the library has a Jacobian. A joined one needs fewer operations.
-    """
-    priors = [term for term in terms if isinstance(term, PriorTerm)]
-    others = [term for term in terms if not isinstance(term, PriorTerm)]
-    return (*others, _joined(priors, config, prior)) if priors else tuple(others)
+    def of_shape(_: CarBatch, state: State) -> PriorResidual:
+        return shape_prior(state.code)
+
+    def of_dimensions(cars: CarBatch, state: State) -> PriorResidual:
+        sigma = constant_like(config.dimensions_sigma_m, state.code)
+        return dimensions_prior(prior.dimensions_and_derivative(state.code), cars.detector_hwl, sigma)
+
+    def of_pose(cars: CarBatch, state: State) -> PriorResidual:
+        sigma = detector_pose_sigma(config, cars)
+        return pose_prior(state.T_obj_cam, cars.detector_T_cam_obj, sigma)
+
+    def term(
+        name: str,
+        weight: float,
+        residual_of: Callable[..., PriorResidual],
+        num_rows: int,
+        sees: str,
+        is_prior: bool = True,
+    ) -> CarPrior:
+        return CarPrior(
+            name,
+            weight,
+            cars,
+            residual_of,
+            num_rows,
+            (sees,),
+            is_prior,
+            config=config,
+            prior=prior,
+            weights={name: 1.0},
+        )
+
+    tilt, num_tilts = (tilt_prior_normal, 2) if config.tilt_form == "normal" else (tilt_prior_cosine, 1)
+    all_terms = [
+        term("shape", config.shape_weight, of_shape, prior.num_codes, CODE),
+        term("height", config.height_weight, height_prior, 1, POSE),
+        term("tilt", config.tilt_weight, tilt, num_tilts, POSE),
+        term("dimensions", config.dimensions_weight, of_dimensions, 3, CODE),
+    ]
+    if cars.detector_pose_sigma is not None or any(config.pose_sigmas):
+        all_terms.append(term("pose", config.pose_weight, of_pose, 4, POSE))
+    if cars.num_offsets:
+        # This prior belongs to the measurements, because it limits how well the images measure a car.
+        all_terms.append(term("rig", RIG_WEIGHT, rig_prior, 1, OFFSET, is_prior=False))
+    return [term for term in all_terms if term.weight > 0]
 
 
-def _joined(terms: Sequence[PriorTerm], config: PriorConfig, prior: ShapePrior) -> JoinedPriors:
+def with_joined_priors(terms: Sequence[AnyTerm]) -> tuple[AnyTerm, ...]:
+    """The terms with the priors of `prior_terms` in one, because an iteration needs only their sum."""
+    priors = [term for term in terms if isinstance(term, CarPrior)]
+    others = [term for term in terms if not isinstance(term, CarPrior)]
+    return (*others, _joined(priors)) if priors else tuple(others)
+
+
+def _joined(terms: Sequence[CarPrior]) -> CarPrior:
     scales = tuple(math.sqrt(term.weight) for term in terms for _ in range(term.num_rows))
 
     def residual_of(cars: CarBatch, state: State) -> PriorResidual:
@@ -208,8 +226,9 @@ def _joined(terms: Sequence[PriorTerm], config: PriorConfig, prior: ShapePrior) 
         return PriorResidual(residual * scale, torch.cat(placed, dim=1) * scale[:, None])
 
     weights = {term.name: term.weight for term in terms}
-    return JoinedPriors(
-        "priors", 1.0, terms[0].cars, residual_of, len(scales), config=config, prior=prior, weights=weights
+    sees = POSE, CODE
+    return replace(
+        terms[0], name="priors", weight=1.0, residual_of=residual_of, num_rows=len(scales), sees=sees, weights=weights
     )
 
 
