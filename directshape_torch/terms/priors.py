@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -134,26 +134,31 @@ class CarPrior(PriorTerm):
     def native_loop(
         self, field: Field, state: State, anchor: NoAnchor, fisher: bool, turn: Turn
     ) -> NativeLoop[NoAnchor] | None:
-        prior = self.prior
-        if not isinstance(prior, PCAShapePrior) or type(prior) is not PCAShapePrior:
-            return None
-        if native_grid(field, state.T_obj_cam, self.cars.input_depth) is None:
+        if type(self.prior) is not PCAShapePrior or native_grid(field, state.T_obj_cam, self.cars.input_depth) is None:
             return None
         from directshape_torch.kernels.priors import priors  # Numba may be missing.
 
         # Nobody reads the residuals of priors.
         part, sums = part_to_write(self, state, anchor, (len(self.cars), 0, 1), False)
-        constants, states = self._constants(prior, state), States(*map(array, tuple(state)[:3]))
-        return NativeLoop(partial(priors, constants, states, turn, sums), part)
+        states = States(*map(array, tuple(state)[:3]))
+        return NativeLoop(partial(priors, self._constants, states, turn, sums), part)
 
-    def _constants(self, prior: PCAShapePrior, state: State) -> PriorArrays:
-        cars, known = self.cars, "pose" in self.weights
-        pose_sigma = detector_pose_sigma(self.config, cars) if known else cars.detector_T_cam_obj[:, 0]
-        offset_sigma_px = state.offset_px if cars.offset_sigma_px is None else cars.offset_sigma_px[:, None]
-        of_shapes = prior.dimensions_mean_hwl, prior.dimensions_basis_hwl
-        sigma_m = constant_like(self.config.dimensions_sigma_m, state.code)
-        tensors = (cars.ground_normal_cam, cars.ground_offset, cars.detector_hwl, *of_shapes, sigma_m,
-                   cars.detector_T_cam_obj, pose_sigma, offset_sigma_px)  # fmt: skip
+    @cached_property
+    def _constants(self) -> PriorArrays:
+        cars, prior, like = self.cars, cast(PCAShapePrior, self.prior), self.cars.input_depth
+        pose_sigma = detector_pose_sigma(self.config, cars) if "pose" in self.weights else like.new_empty(len(cars), 4)
+        sigma_px = cars.offset_sigma_px
+        tensors = (
+            cars.ground_normal_cam,
+            cars.ground_offset,
+            cars.detector_hwl,
+            prior.dimensions_mean_hwl,
+            prior.dimensions_basis_hwl,
+            constant_like(self.config.dimensions_sigma_m, like),
+            cars.detector_T_cam_obj,
+            pose_sigma,
+            like.new_empty(len(cars), 0) if sigma_px is None else sigma_px[:, None],
+        )
         weights: list[Any] = [float(self.weights.get(name, 0.0)) for name in PRIORS]
         return PriorArrays(*(*weights, self.config.tilt_form == "cosine", *map(array, tensors)))
 
