@@ -16,10 +16,10 @@ import torch
 from benchmark_suites.timing import Row, Spread, time_interleaved
 from directshape_torch import Detections, DirectShapeRefiner, FrameBatch
 from directshape_torch.errors import MissingDependencyError
-from directshape_torch.kernels.arguments import Rays
+from directshape_torch.kernels.arguments import Iteration, Rays, Turn
 
-_LOOPS = "march", "silhouettes", "photometric"
-_Record: TypeAlias = list[tuple[Callable[..., None], tuple[Any, ...]]]
+_OF_ROWS = "march", "silhouettes", "photometric"
+_Record: TypeAlias = list[tuple[Callable[..., Any], tuple[Any, ...]]]
 
 
 def loops_row(name: str, calls: Sequence[tuple[FrameBatch, Detections]], rounds: int) -> Row:
@@ -37,11 +37,11 @@ def loops_row(name: str, calls: Sequence[tuple[FrameBatch, Detections]], rounds:
                 refine()
             sides = {"call": refine, "loops": partial(_repeat, record)}
             seconds.append(time_interleaved(sides, rounds, of_processor=True))
-        sizes.append({name: [_num_rows(a) for loop, a in record if loop.__name__ == name] for name in _LOOPS})
+        sizes.append({name: [_num_rows(a) for loop, a in record if loop.__name__ == name] for name in _OF_ROWS})
     whole, share = (median(1e3 * s["call"] for s in seconds), median(s["loops"] / s["call"] for s in seconds))
     each = ", ".join(
         f"{median(len(call[name]) for call in sizes):g} of {name} ({median(sum(call[name]) for call in sizes):g} rows)"
-        for name in _LOOPS
+        for name in _OF_ROWS
     )
     note = f"{share:.2g} of the {whole:.4g} ms of a call; {each}"
     return Row(f"{name}, loops alone: ms", Spread.of([1e3 * s["loops"] for s in seconds]), note)
@@ -51,32 +51,46 @@ def loops_row(name: str, calls: Sequence[tuple[FrameBatch, Detections]], rounds:
 def recorded_loops() -> Iterator[_Record]:
     """A region whose native loops are recorded with their arguments, in order."""
     try:
-        from directshape_torch.kernels import march, photometric, silhouettes
+        from directshape_torch.kernels import extents, iterations, march, photometric, priors, shifts, silhouettes
     except ImportError as error:
         raise MissingDependencyError("numba", "fast", "the time of native loops alone") from error
     record: _Record = []
 
-    def recording(loop: Callable[..., None]) -> Callable[..., None]:
-        def call(*arguments: Any) -> None:
-            record.append((loop, arguments))
-            loop(*arguments)
+    def recording(loop: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
+            record.append((loop, _fresh(arguments)))
+            return loop(*arguments)
 
         return call
 
-    modules = dict(zip(_LOOPS, (march, silhouettes, photometric), strict=True))
-    loops = {name: getattr(module, name) for name, module in modules.items()}
-    for name, module in modules.items():
-        setattr(module, name, recording(loops[name]))
+    loops = (
+        *((march, "march"), (silhouettes, "silhouettes"), (photometric, "photometric"), (priors, "priors")),
+        *((iterations, "propose"), (iterations, "decide"), (shifts, "shifted"), (extents, "extents")),
+    )
+    compiled = [getattr(module, name) for module, name in loops]
+    for (module, name), loop in zip(loops, compiled, strict=True):
+        setattr(module, name, recording(loop))
     try:
         yield record
     finally:
-        for name, module in modules.items():
-            setattr(module, name, loops[name])
+        for (module, name), loop in zip(loops, compiled, strict=True):
+            setattr(module, name, loop)
 
 
 def _repeat(record: _Record) -> None:
     for loop, arguments in record:
-        loop(*arguments)
+        loop(*_fresh(arguments))
+
+
+def _fresh(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+    """The arguments with a copy of what says which cars a loop works on, because loops write to it."""
+
+    def fresh(each: Any) -> Any:
+        if isinstance(each, Iteration):
+            return each._replace(turn=fresh(each.turn))
+        return Turn(*(flags.copy() for flags in each)) if isinstance(each, Turn) else each
+
+    return tuple(map(fresh, arguments))
 
 
 def _num_rows(arguments: tuple[Any, ...]) -> int:

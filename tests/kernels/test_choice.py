@@ -23,7 +23,10 @@ from directshape_torch.kernels.choice import native_grid, without_kernels
 from directshape_torch.shape.field import PackedField
 from directshape_torch.shape.sdf_grid import GridShape
 
-LOOPS = march.march, silhouettes.silhouettes, photometric.photometric
+LOOPS = (
+    *(march.march, silhouettes.silhouettes, photometric.photometric, priors.priors),
+    *(iterations.propose, iterations.decide, shifts.shifted, extents.extents),
+)
 
 
 @pytest.fixture
