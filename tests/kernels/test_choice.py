@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from directshape_torch import kernels
-from directshape_torch.kernels import choice, jit, march, photometric, silhouettes
+from directshape_torch.kernels import choice, extents, iterations, jit, march, photometric, priors, shifts, silhouettes
 from directshape_torch.kernels.choice import native_grid, without_kernels
 from directshape_torch.shape.field import PackedField
 from directshape_torch.shape.sdf_grid import GridShape
