@@ -72,7 +72,9 @@ def _is_installed() -> bool:
         from directshape_torch.kernels import jit, march, photometric, silhouettes  # noqa: F401
     except (ImportError, RuntimeError) as error:  # Numba raises the second where it may write its code nowhere.
         cure = "pip install 'directshape_torch[fast]', or set NUMBA_CACHE_DIR to a folder that can be written"
-        _logger.warning("without native loops refinements on the CPU take two to three times as long (%s): %s", error, cure)
+        _logger.warning(
+            "without native loops refinements on the CPU take two to three times as long (%s): %s", error, cure
+        )
         return False
     if not jit.is_compiled(march.march):
         _logger.warning("Numba compiles native loops once on this machine, which takes some 40 seconds")

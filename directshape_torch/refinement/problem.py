@@ -17,7 +17,7 @@ from torch import Tensor
 from directshape_torch.config import RefinerConfig, SolverConfig, StageConfig
 from directshape_torch.numerics.gradient_mode import map_tensors
 from directshape_torch.numerics.records import Dense
-from directshape_torch.numerics.tables import Chosen, Table
+from directshape_torch.numerics.tables import Table
 from directshape_torch.refinement.native_iterations import iterated
 from directshape_torch.rows import CarSums
 from directshape_torch.shape.field import Field, field_of
@@ -248,10 +248,10 @@ class _Layout:
 
 @dataclass(frozen=True)
 class CarIterations(Table):
-    """These `solver.Iterations` hold the cars of a stage that still move."""
+    """These are the `solver.Iterations` of the cars of a stage."""
 
-    stage: CarStage  # of all cars of the problem
-    terms: tuple[AnyTerm, ...]  # of the B cars that still move, with the rows that can still change
+    stage: CarStage
+    terms: tuple[AnyTerm, ...]  # with the rows that can still change
     rest: Annotated[Tensor | None, Dense("B")]  # cost of rows that cannot change; None if all rows are marched
     factors: Annotated[Tensor | None, Dense("B", "T")]  # see `CarProblem`; this also holds for `sharing`
     masks: MaskRows | None  # rays that are marched at every state; None if rays are tracked
@@ -315,16 +315,6 @@ class CarIterations(Table):
         """The state moved by tangent vectors (B, D) within the trust region."""
         max_code = self.stage.problem.config.solver.max_code
         return self.stage.unknowns.retract(state, step, max_code, LARGEST_ROTATION_RAD)
-
-    def evaluation_of(self, cars: Chosen, at: Evaluation) -> Evaluation:
-        """The evaluation of some of the cars."""
-        cost, gradient, hessian = (x.index_select(0, cars.index) for x in at[:3])
-
-        def kept(term: AnyTerm, anchor: object) -> object:
-            blocks = term.blocks.kept(cars)
-            return map_tensors(lambda x: x.index_select(-2, blocks), anchor)
-
-        return Evaluation(cost, gradient, hessian, tuple(map(kept, self.terms, at.anchors)))
 
 
 CarMinimum: TypeAlias = Minimum[AnyState, Prepared, Evaluation, Figures]

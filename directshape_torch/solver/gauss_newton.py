@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from typing import Annotated, Generic, TypeAlias
 
 import torch
@@ -13,7 +11,7 @@ from torch import Tensor
 from directshape_torch.config import SolverConfig, StageConfig
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.records import Dense
-from directshape_torch.numerics.tables import Chosen, Table
+from directshape_torch.numerics.tables import Table
 from directshape_torch.solver.iteration import begin, has_failed, iterate, step_lengths
 from directshape_torch.solver.problem import (
     RUNNING,
@@ -23,14 +21,9 @@ from directshape_torch.solver.problem import (
     Problem,
     Stage,
     StateT,
-    put_rows,
     where_rows,
 )
 from directshape_torch.status import Status, is_refined
-
-# Ended problems are left out where that saves at least this many iterations of one problem, because the others must be
-# copied. A few problems take nearly as long as fewer.
-_WORTH_LEAVING_OUT = 16
 
 
 @dataclass(frozen=True)
@@ -64,8 +57,8 @@ class Minimum(Generic[StateT, PreparedT, EvaluationT, FiguresT]):
     trajectory: tuple[Iteration[StateT], ...] = ()  # all iterations in order, if they were asked for
 
 
-_CostOfRows: TypeAlias = tuple[Tensor, Tensor, Tensor]
-"""These are the problems (R,) of an iteration, whether each took part, and their costs after it."""
+_Costs: TypeAlias = list[tuple[Tensor, Tensor]]
+"""These say for each iteration which problems (B,) took part, and their costs (B,) after it."""
 
 
 @full_precision()
@@ -95,15 +88,14 @@ def minimise(
         num_problems = len(initial[0])
         ended = torch.full((num_problems,), RUNNING, device=initial[0].device)
         iterations = torch.zeros_like(ended)
-        unfailed = Chosen(ended < 0, range(num_problems))
-        costs: list[_CostOfRows] = []
+        costs: _Costs = []
         starts: list[StateT] = []
         trajectory: list[Iteration[StateT]] | None = [] if record else None
         for number, config_of_stage in enumerate(problem.stages()):
             stage = problem.begin(number, prepared)
             starts.append(state)
-            state, ended, done, unfailed = _run_stage(
-                stage, config_of_stage, state, prepared, ended, unfailed, config, costs, trajectory, number
+            state, ended, done = _run_stage(
+                stage, config_of_stage, state, prepared, ended, config, costs, trajectory, number
             )
             iterations = iterations + done
             prepared = problem.prepare(state)
@@ -133,76 +125,37 @@ def _run_stage(
     state: StateT,
     prepared: PreparedT,
     ended: Tensor,
-    unfailed: Chosen,
     config: SolverConfig,
-    costs: list[_CostOfRows],
+    costs: _Costs,
     trajectory: list[Iteration[StateT]] | None,
     number: int,
-) -> tuple[StateT, Tensor, Tensor, Chosen]:
-    """States, ends and iterations of all problems after a stage, and those that had not failed when the host looked.
+) -> tuple[StateT, Tensor, Tensor]:
+    """States, ends and iterations of all problems after a stage.
 
     Each iteration is added to `costs` and, if there is one, to the trajectory, with the `number` of the stage.
     """
-    iterations = torch.zeros_like(ended)
-    numbers: Sequence[int] = unfailed.numbers
-    if not numbers:
-        return state, ended, iterations, unfailed
-    begun_at = state
-    part, at_state = begun.start(prepared)
+    iterations, at_state = begun.start(prepared)
     progress = begin(state, at_state, ended, config)
-    rows = torch.arange(len(ended), device=ended.device)
-    if len(numbers) < len(ended):
-        rows = unfailed.index
-        part, progress = progress.narrowed(part, unfailed)
     limits = begun.step_limits().to(progress.at_state.gradient)
-    failed: set[int] = set()
-    done = 0
+    at_once = iterations.all_at_once(progress, stage, config, limits) if trajectory is None else None
+    costs += at_once or []
+    done = 0 if at_once is None else stage.max_iterations
     while done < stage.max_iterations:
-        at_once = part.all_at_once(progress, stage, config, limits) if trajectory is None else None
-        if at_once is not None:
-            costs += [(rows, *each) for each in at_once]
-            done = stage.max_iterations
         for _ in range(min(config.block_iterations, stage.max_iterations - done)):
             before, damping, stretched = progress.state, progress.damping, progress.stretched
-            running, accepted, improved = iterate(part, progress, config, limits, stage.over_relaxation)
-            costs.append((rows, running, progress.at_state.cost))
+            running, accepted, improved = iterate(iterations, progress, config, limits, stage.over_relaxation)
+            costs.append((running, progress.at_state.cost))
             if trajectory is not None:
                 lengths = step_lengths(stretched, stage.over_relaxation).to(damping.dtype)
-                zeros, none = (damping.new_zeros(len(ended), dtype=x.dtype) for x in (damping, accepted))
-                of_rows = zip((zeros, zeros, none, none), (damping, lengths, accepted, improved), strict=True)
-                of_all = (nothing.index_copy(0, rows, of_row) for nothing, of_row in of_rows)
-                trajectory.append(Iteration(number, put_rows(begun_at, rows, before), *of_all))
+                trajectory.append(Iteration(number, before, damping, lengths, accepted, improved))
             done += 1
-        codes = _read(progress.ended)
-        failed |= {n for n, code in zip(numbers, codes, strict=True) if code not in (RUNNING, Status.converged.code)}
-        places = [place for place, code in enumerate(codes) if code < 0]
-        if not places:
+        # The host waits for the device at the end of a block alone.
+        if not bool((progress.ended < 0).any()):
             break
-        if (len(numbers) - len(places)) * (stage.max_iterations - done) >= _WORTH_LEAVING_OUT:
-            state, ended, iterations = progress.scatter(rows, state, ended, iterations)
-            numbers = [numbers[place] for place in places]
-            going_on = Chosen(progress.ended < 0, places)
-            rows = rows[going_on.index]
-            part, progress = progress.narrowed(part, going_on)
-    state, ended, iterations = progress.scatter(rows, state, ended, iterations)
-    if done:
-        unfailed = Chosen(~has_failed(ended), [number for number in unfailed.numbers if number not in failed])
-    return state, ended, iterations, unfailed
+    return progress.best_state, progress.ended, progress.iterations
 
 
-def _history(costs: list[_CostOfRows], nothing: Tensor) -> Tensor:
-    """The costs in columns (B, iterations), after `nothing` (B, 0), with NaN where a problem took no part."""
-    columns = [nothing]
-    # Problems that have ended stay in the batch until it is worth leaving them out, so most rows are the same.
-    for _, alike in groupby(costs, key=lambda each: id(each[0])):
-        rows, running, cost = zip(*alike, strict=True)
-        of_rows = torch.where(torch.stack(running, dim=1), torch.stack(cost, dim=1), torch.nan)
-        nan = of_rows.new_full((len(nothing), len(cost)), torch.nan)
-        columns.append(nan.index_copy(0, rows[0], of_rows))
-    return torch.cat(columns[1:] or columns, dim=1)
-
-
-def _read(ended: Tensor) -> list[int]:
-    """The ends of problems (B,), read by the host, which is the only synchronisation of a block, at its end."""
-    codes: list[int] = ended.tolist()
-    return codes
+def _history(costs: _Costs, nothing: Tensor) -> Tensor:
+    """The costs in columns (B, iterations), or `nothing` (B, 0), with NaN where a problem took no part."""
+    columns = [torch.where(running, cost, torch.nan) for running, cost in costs]
+    return torch.stack(columns, dim=1) if columns else nothing

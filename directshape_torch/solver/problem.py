@@ -7,7 +7,7 @@ each near the state before. All results are values, which a caller may keep for 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Generic, Protocol, Self, SupportsIndex, TypeVar, overload
 
 import torch
@@ -72,36 +72,21 @@ RUNNING = -1
 
 @dataclass
 class Progress(Table, Generic[StateT, EvaluationT]):
-    """`Progress` is what changes from iteration to iteration, for the problems of one compacted batch."""
+    """`Progress` is what changes from iteration to iteration, for B problems."""
 
     state: StateT
     best_state: StateT
     best_cost: Annotated[Tensor, Dense("B")]
-    at_state: EvaluationT  # only the iterations know its axes
+    at_state: EvaluationT
     damping: Annotated[Tensor, Dense("B")]
     # whether the next step is over-relaxed, in stages that over-relax
     stretched: Annotated[Tensor, Dense("B", kind="flags")]
     ended: Annotated[Tensor, Dense("B", kind="index")]  # status code or RUNNING
     iterations: Annotated[Tensor, Dense("B", kind="index")]
 
-    def narrowed(
-        self, iterations: Iterations[StateT, EvaluationT], problems: Chosen
-    ) -> tuple[Iterations[StateT, EvaluationT], Progress[StateT, EvaluationT]]:
-        """The iterations of some of the problems, and their progress."""
-        at_state = iterations.evaluation_of(problems, self.at_state)
-        return iterations.of(problems), replace(self.of(problems), at_state=at_state)
-
-    def scatter(self, rows: Tensor, state: StateT, ended: Tensor, iterations: Tensor) -> tuple[StateT, Tensor, Tensor]:
-        """Best states, ends and iterations of all problems, with this batch put into its rows."""
-        return (
-            put_rows(state, rows, self.best_state),
-            ended.index_copy(0, rows, self.ended),
-            iterations.index_copy(0, rows, self.iterations),
-        )
-
 
 class Iterations(Protocol[StateT, EvaluationT]):
-    """The `Iterations` of a stage evaluate B problems, which become fewer as problems end."""
+    """The `Iterations` of a stage evaluate B problems."""
 
     @property
     def sharing(self) -> Sharing:
@@ -134,14 +119,6 @@ class Iterations(Protocol[StateT, EvaluationT]):
         Returns:
             For each iteration which problems (B,) took part and their costs (B,) after it; None without such loops.
         """
-        ...
-
-    def of(self, problems: Chosen) -> Self:
-        """The iterations of some of the problems."""
-        ...
-
-    def evaluation_of(self, problems: Chosen, at: EvaluationT) -> EvaluationT:
-        """The evaluation of some of the problems."""
         ...
 
 

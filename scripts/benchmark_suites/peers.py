@@ -29,11 +29,12 @@ from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, load_c
 from directshape_torch.errors import MissingDependencyError
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.kernels.choice import without_kernels
+from directshape_torch.numerics.gradient_mode import map_tensors
 from directshape_torch.numerics.tables import Chosen
 from directshape_torch.refinement.problem import CarIterations, CarProblem
 from directshape_torch.shape.field import field_of
-from directshape_torch.solver.iteration import RUNNING, begin, iterate
-from directshape_torch.solver.problem import remade
+from directshape_torch.solver.iteration import begin, iterate
+from directshape_torch.solver.problem import RUNNING, remade
 from directshape_torch.state.cars import CarState
 from directshape_torch.terms.term import Evaluation
 
@@ -132,8 +133,10 @@ def by_this_library(iterations: CarIterations, at: Evaluation, state: CarState, 
     """Steps of this library that are not over-relaxed, as those of the peers are not."""
     config, limits = iterations.stage.problem.config.solver, iterations.stage.step_limits()
     progress = begin(state, at, torch.full_like(at.cost, RUNNING, dtype=torch.int64), config)
-    for _ in range(steps):
-        iterate(iterations, progress, config, limits)
+    stage = replace(iterations.stage.config, max_iterations=steps, over_relaxation=1.0)
+    if iterations.all_at_once(progress, stage, config, limits) is None:
+        for _ in range(steps):
+            iterate(iterations, progress, config, limits)
     return progress.state
 
 
@@ -142,7 +145,10 @@ class LeastSquares:
 
     def __init__(self, iterations: CarIterations, at: Evaluation, state: CarState, number: int) -> None:
         chosen = Chosen(torch.arange(len(at.cost)) == number, [number])
-        self._iterations, self._at = iterations.of(chosen), iterations.evaluation_of(chosen, at)
+        blocks = [term.blocks.kept(chosen) for term in iterations.terms]
+        anchors = map(_taken, at.anchors, blocks)
+        self._iterations = iterations.of(chosen)
+        self._at = Evaluation(*(part[number : number + 1] for part in at[:3]), tuple(anchors))
         self.state = remade(state, (part[number : number + 1] for part in state))
         self.nowhere = torch.zeros(1, state.unknowns.size, dtype=torch.float64)
         self._weigh()
@@ -167,6 +173,10 @@ class LeastSquares:
         rows = zip(self._iterations.terms, self._unweighted(self.nowhere), strict=True)
         weights = [t.block_weight[:, None, None] * t.row_weight * t.norm(r).hessian_weight for t, r in rows]
         self._roots = [weight.sqrt() for weight in weights]
+
+
+def _taken(anchor: object, blocks: Tensor) -> object:
+    return map_tensors(lambda x: x.index_select(-2, blocks), anchor)
 
 
 def _cars(iterations: CarIterations, at: Evaluation, state: CarState) -> list[LeastSquares]:

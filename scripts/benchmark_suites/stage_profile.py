@@ -47,7 +47,7 @@ PARTS: dict[str, tuple[Any, ...]] = {
     "priors": (PriorTerm.linear,),
     "sums over pixels and cars": (term.part_of, term.summed),
     "solve and step": (damped_step, Unknowns.retract),
-    "iterations, the rest": (iterate, CarIterations.choose, CarIterations.of, CarIterations.evaluation_of),
+    "iterations, the rest": (iterate, CarIterations.choose),
     "figures at the end": (CarStage.figures,),
     _RESULT: (result_of,),
 }

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from directshape_torch.config import StageConfig
 from directshape_torch.numerics.records import Dense
-from directshape_torch.numerics.tables import Chosen, take_rows
+from directshape_torch.numerics.tables import Chosen
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.solver.sharing import INDEPENDENT, Sharing
 
@@ -80,15 +80,11 @@ class VectorProblem:
     def all_at_once(self, *_: object) -> None:
         return None
 
-    def evaluation_of(self, problems: Chosen, at: Energy) -> Energy:
-        return take_rows(at, problems.index)
-
 
 class ResidualProblem(VectorProblem):
     """A `ResidualProblem` minimises `sum_i r_i(x)^2 / 2` of a residual for each problem, with autograd Jacobians.
 
-    It records the points of evaluation, the near points that it was given, and the number of problems left whenever
-    some had ended.
+    It records the points of evaluation and the near points that it was given.
     """
 
     def __init__(
@@ -101,7 +97,6 @@ class ResidualProblem(VectorProblem):
     ) -> None:
         super().__init__(stages, num_unknowns, limit)
         self.residual, self.identity = residual, identity
-        self.compactions: list[int] = []
         self.evaluated: list[Tensor] = []
         self.near: list[Tensor] = []
 
@@ -123,7 +118,6 @@ class ResidualProblem(VectorProblem):
         return super().evaluate(state, near)
 
     def of(self, problems: Chosen) -> Self:
-        self.compactions.append(len(problems.numbers))
         part = type(self).__new__(type(self))
         identity, sharing = self.identity[problems.index], self.sharing.of(problems)
         part.__dict__ = {**self.__dict__, "identity": identity, "sharing": sharing}

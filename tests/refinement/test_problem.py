@@ -12,7 +12,7 @@ import pytest
 import torch
 from helpers.derivatives import moved
 from helpers.five_cars import five_cars, step_of
-from helpers.problems import DEFAULT, GEOMETRIC, MARCHED, PAPER, figures_at, left_of
+from helpers.problems import DEFAULT, GEOMETRIC, PAPER, figures_at, left_of
 from helpers.problems import begun_stage as begun_at
 from helpers.synthetic_scene import cached_street, disturbed, select
 from helpers.term_cases import COMBINED, case
@@ -23,15 +23,14 @@ from directshape_torch.errors import ConfigError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.stereo_dataset import open_dataset
-from directshape_torch.numerics.tables import Chosen
-from directshape_torch.refinement.problem import CarIterations, CarMinimum, CarProblem, CarStage
+from directshape_torch.refinement.problem import CarMinimum, CarProblem, CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.solver.gauss_newton import minimise
 from directshape_torch.state.cars import CarState
-from directshape_torch.terms.term import Evaluation, Figures
+from directshape_torch.terms.term import Figures
 
 DEMO = Path(__file__).parents[2] / "directshape_torch" / "assets" / "demo"
 SETS = {"demo": "noisy_stereo", "rendered": "stereo", "kitti": "noisy_stereo"}
@@ -114,30 +113,7 @@ def test_so_it_is_on_the_synthetic_street_for_all_terms(regime: str) -> None:
     assert _gradient_error(stage, state, stage.problem.term_names).max() < 1e-4
 
 
-# Iterations against figures
-
-
-def _narrowed(iterations: CarIterations, at: Evaluation, cars: Chosen) -> tuple[CarIterations, Evaluation]:
-    return iterations.of(cars), iterations.evaluation_of(cars, at)
-
-
-@pytest.mark.parametrize("config", [DEFAULT, MARCHED], ids=["tracked", "marched"])
-@pytest.mark.parametrize("keep", [[0, 1, 2, 3, 4], [1, 4], [2], []])
-def test_cars_that_leave_change_nothing_of_the_others(config: RefinerConfig, keep: list[int]) -> None:
-    """In the middle of a stage, and once more among those that went on."""
-    stage, state = begun_stage(config)
-    iterations, at = stage.start(stage.problem.prepare(state))
-    kept = torch.zeros(5, dtype=torch.bool)
-    kept[keep] = True
-    fewer, at_fewer = _narrowed(iterations, at, Chosen(kept, keep))
-    _assert_same(at_fewer[:3], tuple(x[kept] for x in at[:3]), 0)
-    for scale in (0.005, 0.02):
-        there = moved(state, step_of(5, scale, 0.1))
-        at, at_fewer = iterations.evaluate(there, at), fewer.evaluate(CarState(*(x[kept] for x in there)), at_fewer)
-        _assert_same(at_fewer[:3], tuple(x[kept] for x in at[:3]), 1e-12)
-        if len(keep) == 2:
-            fewer, at_fewer = _narrowed(fewer, at_fewer, Chosen(torch.tensor([False, True]), [1]))
-            kept, keep = torch.arange(5) == keep[1], keep[1:]
+# Iterations
 
 
 def test_the_state_moves_within_the_trust_region(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -81,15 +81,12 @@ def test_each_problem_is_solved_as_if_alone() -> None:
 
 
 @pytest.mark.parametrize("block", [1, 3, 100])
-def test_compaction_changes_nothing(block: int) -> None:
+def test_how_often_the_host_looks_changes_nothing(block: int) -> None:
     reference = minimise(rosenbrock(6), start(6, 2, -1.3), replace(DAMPED, block_iterations=1000))
-    problem = rosenbrock(6)
-    result = minimise(problem, start(6, 2, -1.3), replace(DAMPED, block_iterations=block))
+    result = minimise(rosenbrock(6), start(6, 2, -1.3), replace(DAMPED, block_iterations=block))
     torch.testing.assert_close(result.state.x, reference.state.x, rtol=0, atol=1e-13)
     assert (result.iterations == reference.iterations).all()
     assert (result.status == reference.status).all()
-    if block == 1:
-        assert len(problem.compactions) > 1
 
 
 def _poisoned(kind: str) -> ResidualProblem:
