@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.kitti_folder import write_data_set
-from helpers.output_folders import result_files
 from test_refine_command import command
 
 from directshape_torch.cli.main import main
@@ -57,6 +57,8 @@ def test_scans_are_read_in_the_left_camera_and_batched(source: Path) -> None:
     from directshape_torch.io.frame_collation import collate
 
     dataset = open_dataset("kitti", source, source / "detections", source / "masks", lidar_dir=source / "velodyne")
+    # As a worker gets it.
+    dataset = pickle.loads(pickle.dumps(dataset))
     loaded = [dataset.load(frame_id) for frame_id in FRAMES]
     points = loaded[0].frame.points_cam
     label = np.array((source / "training" / "label_2" / "000000.txt").read_text().split()[11:14], dtype=float)
@@ -67,13 +69,11 @@ def test_scans_are_read_in_the_left_camera_and_batched(source: Path) -> None:
     assert frames.points_cam.shape == (2, 64, 3)
 
 
-def test_a_worker_gives_the_same_bytes_and_the_manifest_knows_the_scans(source: Path, tmp_path: Path) -> None:
-    assert refine(source, tmp_path / "a", "--lidar", source / "velodyne", "--threads", 1) == 0
-    assert refine(source, tmp_path / "b", "--lidar", source / "velodyne", "--workers", 1) == 0
-    assert result_files(tmp_path / "a") == result_files(tmp_path / "b")
-    assert "lidar" in read_shapes(tmp_path / "a" / "shapes" / "000000.npz").term_names
-    summary = json.loads((tmp_path / "a" / "summary.json").read_text())
-    assert "lidar" in RunFolder(tmp_path / "a").read("000001").record.inputs
+def test_the_results_and_the_manifest_know_the_scans(source: Path, tmp_path: Path) -> None:
+    assert refine(source, tmp_path, "--lidar", source / "velodyne") == 0
+    assert "lidar" in read_shapes(tmp_path / "shapes" / "000000.npz").term_names
+    assert "lidar" in RunFolder(tmp_path).read("000001").record.inputs
+    summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["config"]["extra_terms"] == ["LidarPoints(weight=300.0, huber_m=0.1)"]
 
 

@@ -16,6 +16,7 @@ INSPECT = "inspect --out {out}"
 PRIOR = "build-prior --meshes {meshes} --out {out}/car.safetensors"
 REFINE = "refine --data {root} --detections {root}/detections --out {out} --prior {root}/prior.safetensors --device cpu"
 FILE = "{root}/prior.safetensors"
+DEMO_MASKS = f"calibrate-rig --data {DEMO_FOLDER} --masks {DEMO_FOLDER}/training/masks"
 MASKED = f"{REFINE} --masks {{root}}/masks"
 
 CASES = [
@@ -87,6 +88,13 @@ CASES = [
         "such as 000000, got 77",
     ),
     ("evaluate --labels {root}/training/label_2 --results {root}/training/label_2", "a result without score"),
+    (f"compare --labels {DEMO_FOLDER}/training/label_2 --after nowhere", "nowhere: is no folder of result files"),
+    (f"{DEMO_MASKS.replace('calibrate-rig', 'refine')} --classes Van --out {{out}}", "classes: expected Car"),
+    (f"{DEMO_MASKS} --out {{out}}/a.json", "--detections: expected boxes of a detector, got none; --from detections"),
+    (
+        f"{DEMO_MASKS} --detections {DEMO_FOLDER}/detections/noisy_stereo --from sizes --out {{out}}/a.json",
+        "--detections: expected none, got some",
+    ),
     (
         f"evaluate --type Truc --labels {DEMO_FOLDER}/training/label_2 --results {DEMO_FOLDER}/detections/noisy_stereo",
         "a class of these files: Car, got Truc",
