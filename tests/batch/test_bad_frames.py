@@ -17,6 +17,7 @@ from directshape_torch.batch.options import RunObserver
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.errors import DirectShapeError
 from directshape_torch.io.result_files import read_shapes
+from directshape_torch.io.run_status import read_status
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.scene.frames import FrameBatch
 
@@ -31,12 +32,15 @@ def test_a_truncated_image_is_reported_and_the_others_go_on(kitti_copy: Path, tm
     assert list(summary.failed) == ["000001"]
     assert "image_3/000001.png" in summary.failed["000001"]
     assert (tmp_path / "out" / "failed" / "000001.txt").read_text() == summary.failed["000001"] + "\n"
+    status = read_status(tmp_path / "out")
+    assert (status.failed, status.num_done, status.num_left) == (summary.failed, 2, 0)
     assert not (tmp_path / "out" / "data" / "000001.txt").exists()
     for name in ("data/000000.txt", "data/000002.txt", "shapes/000002.npz"):
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     # Mended, the frame is tried again, and all is as if nothing had happened.
     image.write_bytes(content)
-    assert refine(kitti_copy, tmp_path / "out").resumed == ("000000", "000002")
+    again = refine(kitti_copy, tmp_path / "out")
+    assert (again.resumed, again.failed) == (("000000", "000002"), {})
     assert result_files(tmp_path / "out") == result_files(tmp_path / "whole")
 
 
@@ -80,6 +84,23 @@ def test_too_little_memory_says_what_to_do(
     assert f"too little memory for 1 frame in a call ({type(error).__name__}: " in summary.failed["000002"]
     # 3 = 2 + 1, and 2 = 1 + 1.
     assert any(warning.startswith("2 calls did not work with all of their frames") for warning in summary.warnings)
+
+
+class Narrow(QuickRefiner):
+    """A `Narrow` asks for more memory than there is where it gets several frames."""
+
+    def forward(self, frames: FrameBatch, *args: Any) -> RefinementResult:
+        if len(frames) > 1:
+            torch.empty(2**50)
+        return super().forward(frames, *args)
+
+
+def test_a_call_without_the_memory_for_its_frames_is_halved(shared_kitti: Path, tmp_path: Path) -> None:
+    summary = refine(shared_kitti, tmp_path / "narrow", Narrow(shared_kitti), batch_frames=3)
+    assert summary.exit_code == 0
+    assert sorted(call.frame_ids for call in summary.timings.calls) == [(frame_id,) for frame_id in FRAMES]
+    refine(shared_kitti, tmp_path / "one", batch_frames=1)
+    assert result_files(tmp_path / "narrow") == result_files(tmp_path / "one")
 
 
 def test_a_file_that_cannot_be_written_is_reported_and_the_others_go_on(shared_kitti: Path, tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import sys
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import quick_runs
-from helpers.faulty_refiners import DeadlyRefiner, HungryRefiner, QuickRefiner
+from helpers.faulty_refiners import QuickRefiner
 from helpers.kitti_folder import write_data_set
 from helpers.output_folders import result_files
 from numpy.typing import NDArray
@@ -113,22 +112,6 @@ class Listener(RunObserver):
         self.ended.append((frame_id, failure is None))
 
 
-def test_two_workers_of_which_one_is_killed_write_the_bytes_of_one_process(root: Path, tmp_path: Path) -> None:
-    refine(root, tmp_path / "one", QuickRefiner(root), batch_frames=2, threads=1)
-    listener = Listener()
-    deadly = DeadlyRefiner(root, tmp_path, once=[FRAMES[3]])
-    summary = refine(root, tmp_path / "two", deadly, observer=listener, batch_frames=2, workers=2)
-    assert (tmp_path / FRAMES[3]).exists(), "nobody was killed"
-    assert summary.exit_code == 0
-    assert sorted(listener.ended) == [(frame_id, True) for frame_id in FRAMES]
-    expected, found = result_files(tmp_path / "one"), result_files(tmp_path / "two")
-    assert {f"meshes/{FRAMES[4]}_1.ply", f"shapes/{FRAMES[4]}.npz", "summary.json"} <= set(expected)
-    assert found == expected
-    assert sorted(call.frame_ids for call in summary.timings.calls) == [FRAMES[:2], FRAMES[2:4], FRAMES[4:]]
-    assert (summary.timings.workers, summary.timings.threads) == (2, 1)
-    assert read_status(tmp_path / "two").num_done == len(FRAMES)
-
-
 def blank(*_: object) -> NDArray[np.uint8]:
     return np.zeros((2, 2), np.uint8)
 
@@ -147,43 +130,23 @@ class DeadlyPicture:
         return blank()
 
 
-def test_what_was_finished_before_the_death_stays_in_the_call_and_is_not_written_again(
-    root: Path, tmp_path: Path
-) -> None:
-    deadly = DeadlyPicture(FRAMES[2], tmp_path / "note")
-    summary = refine(root, tmp_path / "two", QuickRefiner(root), draw=deadly, batch_frames=3, workers=1)
+def test_two_workers_of_which_one_is_killed_write_the_bytes_of_one_process(root: Path, tmp_path: Path) -> None:
+    """What the dead one had finished stays in the call, and is not written again."""
+    refine(root, tmp_path / "one", QuickRefiner(root), draw=blank, batch_frames=2, threads=1)
+    listener, deadly = Listener(), DeadlyPicture(FRAMES[3], tmp_path / "note")
+    options = {"draw": deadly, "observer": listener, "batch_frames": 2, "workers": 2}
+    summary = refine(root, tmp_path / "two", QuickRefiner(root), **options)
     died_at = (tmp_path / "note").stat().st_mtime
-    written = [path.stem for path in (tmp_path / "two" / "shapes").iterdir() if path.stat().st_mtime > died_at]
-    assert sorted(written) == list(FRAMES[2:])
-    assert sorted(call.frame_ids for call in summary.timings.calls) == [FRAMES[:3], FRAMES[3:]]
-    assert sorted(summary.frames) == list(FRAMES)
-    refine(root, tmp_path / "one", QuickRefiner(root), draw=blank, batch_frames=3, threads=1)
-    assert result_files(tmp_path / "two") == result_files(tmp_path / "one")
-
-
-def test_a_frame_that_kills_its_worker_fails_and_the_others_go_on(root: Path, tmp_path: Path) -> None:
-    deadly = DeadlyRefiner(root, tmp_path, always=[FRAMES[1]])
-    listener = Listener()
-    summary = refine(root, tmp_path / "out", deadly, observer=listener, batch_frames=1, workers=1)
-    assert summary.exit_code == 1
-    assert summary.failed == {FRAMES[1]: "its worker died each of 2 times (killed, out of memory or crashed)"}
-    assert sorted(listener.ended) == [(frame_id, frame_id != FRAMES[1]) for frame_id in FRAMES]
-    # The next run tries it again, here in this process, and all is as if nothing had happened.
-    again = refine(root, tmp_path / "out", QuickRefiner(root), batch_frames=1, threads=1)
-    assert (again.exit_code, len(again.resumed)) == (0, 4)
-    refine(root, tmp_path / "one", QuickRefiner(root), batch_frames=1, threads=1)
-    assert result_files(tmp_path / "out") == result_files(tmp_path / "one")
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits of memory are those of Linux")
-def test_a_worker_without_the_memory_for_a_call_halves_it(root: Path, tmp_path: Path) -> None:
-    summary = refine(root, tmp_path / "hungry", HungryRefiner(root), batch_frames=4, workers=1)
+    before, after = ((tmp_path / "two" / "shapes" / f"{name}.npz").stat().st_mtime for name in FRAMES[2:4])
+    assert before < died_at < after
     assert summary.exit_code == 0
-    # 4 = 2 + 2 and each 2 = 1 + 1; the fifth frame is alone from the start.
-    assert any(warning.startswith("3 calls did not work with all of their frames") for warning in summary.warnings)
-    assert sorted(call.frame_ids for call in summary.timings.calls) == [(frame_id,) for frame_id in FRAMES]
-    refine(root, tmp_path / "one", QuickRefiner(root), batch_frames=1, threads=1)
-    assert result_files(tmp_path / "hungry") == result_files(tmp_path / "one")
+    assert sorted(listener.ended) == [(frame_id, True) for frame_id in FRAMES]
+    expected, found = result_files(tmp_path / "one"), result_files(tmp_path / "two")
+    assert {f"meshes/{FRAMES[4]}_1.ply", f"shapes/{FRAMES[4]}.npz", "summary.json"} <= set(expected)
+    assert found == expected
+    assert sorted(call.frame_ids for call in summary.timings.calls) == [FRAMES[:2], FRAMES[2:4], FRAMES[4:]]
+    assert (summary.timings.workers, summary.timings.threads) == (2, 1)
+    assert read_status(tmp_path / "two").num_done == len(FRAMES)
 
 
 class OfTwoWordsError(Exception):
@@ -208,7 +171,7 @@ class Interrupter(RunObserver):
 
 def test_no_worker_is_left_by_an_interrupt_at_a_report(root: Path, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
-        refine(root, tmp_path, QuickRefiner(root), observer=Interrupter(), batch_frames=1, workers=2)
+        refine(root, tmp_path, QuickRefiner(root), observer=Interrupter(), batch_frames=1, workers=1)
     assert multiprocessing.active_children() == []
 
 

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -60,8 +60,8 @@ def slow_run(root: Path, out: Path) -> Iterator[subprocess.Popen[str]]:
                 os.killpg(run.pid, signal.SIGKILL)
 
 
-def stopped_in_the_middle(root: Path, out: Path, by: signal.Signals) -> None:
-    """Stop a run with two workers when it has finished a frame or two, and wait until all of its processes are gone."""
+def stopped_in_the_middle(root: Path, out: Path, by: signal.Signals) -> str:
+    """What a run with two workers says that is stopped after a frame or two; all of its processes are gone."""
     with slow_run(root, out) as run:
         wait_until(lambda: run.poll() is not None or len(done_frames(out)) > 0)
         assert run.poll() is None, "the run ended before it was stopped"
@@ -73,8 +73,9 @@ def stopped_in_the_middle(root: Path, out: Path, by: signal.Signals) -> None:
             os.killpg(run.pid, by)
         else:
             run.send_signal(by)
-        run.wait(_PATIENCE_S)
+        _, said = run.communicate(timeout=_PATIENCE_S)
         wait_until(lambda: not any(map(is_running, workers)))
+    return said
 
 
 def children(pid: int) -> list[int]:
@@ -134,13 +135,15 @@ def test_a_run_that_is_killed_and_damaged_goes_on_where_it_was(root: Path, tmp_p
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks for processes in /proc")
 def test_an_interrupted_run_ends_its_frames_and_goes_on(root: Path, tmp_path: Path, undisturbed: Path) -> None:
     out = tmp_path / "out"
-    stopped_in_the_middle(root, out, signal.SIGINT)
+    said = stopped_in_the_middle(root, out, signal.SIGINT)
+    assert said.count("Traceback") == said.count("KeyboardInterrupt") == 1
     status = read_status(out)
     assert len(list((out / "data").glob("*.txt"))) == status.num_done < len(FRAMES)
     assert len(refine(root, out).resumed) == status.num_done
     assert result_files(out) == result_files(undisturbed)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks for processes in /proc")
 def test_workers_that_still_start_say_nothing_of_an_interrupt(root: Path, tmp_path: Path) -> None:
     with slow_run(root, tmp_path / "out") as run:
@@ -186,7 +189,7 @@ def test_a_full_disk_stops_a_run_and_room_lets_it_go_on(
     assert result_files(out) == result_files(undisturbed)
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks for processes in /proc")
+@pytest.mark.long
 def test_two_runs_at_once(root: Path, tmp_path: Path, undisturbed: Path) -> None:
     with slow_run(root, tmp_path / "out") as one, slow_run(root, tmp_path / "out") as other:
         for run in (one, other):
@@ -196,21 +199,24 @@ def test_two_runs_at_once(root: Path, tmp_path: Path, undisturbed: Path) -> None
 
 
 class Partner(RunObserver):
-    """A `Partner` refines the other frames into the same folder after the first frame has ended."""
+    """A `Partner` refines frames into the same folder after the first frame has ended."""
 
-    def __init__(self, root: Path, out: Path) -> None:
-        self.root, self.out = root, out
+    def __init__(self, root: Path, out: Path, frames: Sequence[str]) -> None:
+        self.root, self.out, self.frames = root, out, frames
 
     def finished(self, frame_id: str, failure: str | None) -> None:
         if frame_id == FRAMES[0]:
-            rest = quick_runs.dataset(self.root, frames=FRAMES[2:])
+            rest = quick_runs.dataset(self.root, frames=self.frames)
             refine_dataset(rest, QuickRefiner(self.root), self.out, RefineOptions(threads=1))
 
 
-def test_pieces_of_a_data_set_share_a_folder(root: Path, tmp_path: Path, undisturbed: Path) -> None:
-    piece, partner = quick_runs.dataset(root, frames=FRAMES[:2]), Partner(root, tmp_path)
+@pytest.mark.parametrize(("own", "others"), [(FRAMES[:2], FRAMES[2:]), (FRAMES, FRAMES)], ids=["pieces", "the same"])
+def test_two_runs_share_a_folder(
+    root: Path, tmp_path: Path, undisturbed: Path, own: tuple[str, ...], others: tuple[str, ...]
+) -> None:
+    piece, partner = quick_runs.dataset(root, frames=own), Partner(root, tmp_path, others)
     summary = refine_dataset(piece, QuickRefiner(root), tmp_path, RefineOptions(threads=1), partner)
-    assert list(summary.frames) == list(FRAMES[:2])
+    assert list(summary.frames) == list(own)
     assert result_files(tmp_path) == result_files(undisturbed)
 
 
@@ -234,18 +240,6 @@ def test_a_run_whose_folder_another_one_has_taken_says_so(root: Path, tmp_path: 
 def test_a_url_is_no_output_folder(root: Path) -> None:
     with pytest.raises(InputError, match=r"out: expected a folder of a file system, got s3:/bucket/out; mount it"):
         refine(root, Path("s3://bucket/out"))
-
-
-def test_failures_are_noted_and_forgotten(root: Path, tmp_path: Path, undisturbed: Path) -> None:
-    whole = (root / "masks" / "000003.json").read_bytes()
-    (root / "masks" / "000003.json").write_text("{")
-    failed = refine(root, tmp_path).failed
-    assert list(failed) == ["000003"]
-    status = read_status(tmp_path)
-    assert (status.failed, status.num_done, status.num_left) == (failed, len(FRAMES) - 1, 0)
-    (root / "masks" / "000003.json").write_bytes(whole)
-    assert refine(root, tmp_path).failed == {}
-    assert result_files(tmp_path) == result_files(undisturbed)
 
 
 @pytest.mark.parametrize("name", ["data/000002.txt", "shapes/000002.npz"])
