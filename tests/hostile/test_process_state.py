@@ -57,9 +57,12 @@ def open_files() -> list[str]:
     return sorted(str(link.readlink()) for link in links)
 
 
+ONE_STEP = "stages=[{contour_width_px: 0.5, image_level: 0, max_iterations: 1}]"
+
+
 def forward(_: Path, __: Path) -> None:
     prior, street = cached_street()
-    config = load_config(None, ["stages=[{contour_width_px: 0.5, image_level: 0, max_iterations: 1}]"])
+    config = load_config(None, [ONE_STEP])
     DirectShapeRefiner(prior, config)(street.frames, street.detections)
 
 
@@ -99,10 +102,7 @@ def write(_: Path, out: Path) -> None:
 def gradient(_: Path, __: Path) -> None:
     prior, street = cached_street()
     masks = street.detections.mask_left.dense().double().clone().requires_grad_()
-    config = load_config(
-        "fast",
-        ["backward.mode=unroll", *EVERY_RESULT],
-    )
+    config = load_config("fast", ["backward.mode=unroll", *EVERY_RESULT])
     result = DirectShapeRefiner(prior, config)(street.frames, replace(street.detections, mask_left=masks))
     result.T_cam_obj.sum().backward()
 
@@ -123,7 +123,7 @@ def commands(root: Path, out: Path) -> None:
     data, labels, results = data_options(root), str(root / "training" / "label_2"), str(out / "out" / "data")
     with_prior = [*data, "--prior", str(root / "prior.safetensors")]
     for command in (
-        ["refine", *with_prior, "--out", str(out / "refined"), "--set", "solver.max_code=2", "--frames", "000000"],
+        ["refine", *with_prior, "--out", str(out / "refined"), "--set", ONE_STEP, "--frames", "000000"],
         ["check-data", *data, "--frames", "000000"],
         ["status", str(out / "out")],
         ["report", str(out / "out"), "--html", str(out / "page.html"), *with_prior],
@@ -131,7 +131,7 @@ def commands(root: Path, out: Path) -> None:
         ["compare", "--labels", labels, "--before", str(root / "detections"), "--after", results, "--frames", "0"],
         ["evaluate", "--labels", labels, "--results", str(root / "detections")],
         ["calibrate-rig", *data, "--out", str(out / "rig.json")],
-        ["inspect", "--frame", "000000", "--car", "1", *with_prior, "--out", str(out / "figures")],
+        ["inspect", "--frame", "000000", "--car", "1", *with_prior, "--set", ONE_STEP, "--out", str(out / "f")],
     ):
         assert main(command) == 0, command
     with suppress(SystemExit):

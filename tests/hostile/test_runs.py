@@ -37,7 +37,7 @@ def undisturbed(shared_kitti: Path, tmp_path_factory: pytest.TempPathFactory) ->
     return out
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.7])
+@pytest.mark.parametrize("delay_s", [0.0, pytest.param(0.7, marks=pytest.mark.long)])
 def test_a_worker_that_is_killed_as_it_starts(
     shared_kitti: Path, tmp_path: Path, undisturbed: Path, delay_s: float
 ) -> None:
