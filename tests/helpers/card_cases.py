@@ -67,8 +67,8 @@ OTHER_FORMS = with_solver(
     initial_damping=0.0,
     accept_every_step=True,
 )
-# Of views of tracks as well as of cars by themselves.
-UNROLLED = replace(_FEW_STEPS, backward=replace(DEFAULT.backward, mode="unroll"))
+# Of views of tracks as well as of cars by themselves, in one stage.
+UNROLLED = replace(_FEW_STEPS, stages=_FEW_STEPS.stages[-1:], backward=replace(DEFAULT.backward, mode="unroll"))
 
 
 def compare(config: RefinerConfig, prior: ShapePrior | None = None, tracks: bool = False) -> dict[str, float]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import Literal
 
 import pytest
@@ -21,6 +23,7 @@ from torch import Tensor
 
 from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.geometry import se3
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
@@ -32,6 +35,7 @@ def inputs() -> StreetInputs:
     return StreetInputs()
 
 
+STEP = 1e-5
 EVERYTHING = ("masks", "images", "weights", "basis", "mean", "sigma", "dimensions")
 
 
@@ -41,14 +45,19 @@ def gradients(inputs: StreetInputs) -> dict[str, dict[str, float]]:
     return {mode: gradients_by(inputs, with_mode(mode), EVERYTHING) for mode in ("implicit", "unroll")}
 
 
+@pytest.fixture(scope="module")
+def ends(inputs: StreetInputs) -> Callable[[str], list[RefinementResult]]:
+    """The results with an input moved by `STEP` both ways, of one refinement each."""
+    return cache(lambda what: [inputs.refine(SETTLED, what, sign * STEP) for sign in (1, -1)])
+
+
 @pytest.mark.parametrize("what", EVERYTHING)
 def test_modes_agree_with_each_other_and_with_differences(
-    inputs: StreetInputs, gradients: dict[str, dict[str, float]], what: str
+    gradients: dict[str, dict[str, float]], ends: Callable[[str], list[RefinementResult]], what: str
 ) -> None:
     implicit, unrolled = (gradients[mode][what] for mode in ("implicit", "unroll"))
-    step = 1e-5
-    ends = [float(summary(inputs.refine(SETTLED, what, sign * step))) for sign in (1, -1)]
-    numeric = (ends[0] - ends[1]) / (2 * step)
+    after, before = (float(summary(end)) for end in ends(what))
+    numeric = (after - before) / (2 * STEP)
     assert abs(implicit) > 1e-4
     # The best state by the cost may stand some steps before the point where the gradient vanishes.
     assert abs(unrolled - implicit) < 1e-3 + 0.02 * abs(implicit)
@@ -97,13 +106,12 @@ def test_the_input_pose_counts_in_every_direction(inputs: StreetInputs, unknown:
     assert abs(float(gradient) - numeric) < 1e-5 * abs(numeric)
 
 
-def test_boxes_carry_the_gradient(inputs: StreetInputs) -> None:
+def test_boxes_carry_the_gradient(inputs: StreetInputs, ends: Callable[[str], list[RefinementResult]]) -> None:
     by = torch.zeros((), dtype=torch.float64, requires_grad=True)
     boxes = inputs.refine(with_mode("implicit"), "mean", by).boxes()
     (gradient,) = torch.autograd.grad(boxes.dimensions_hwl.sum(), by)
-    step = 1e-4
-    ends = [float(inputs.refine(SETTLED, "mean", sign * step).boxes().dimensions_hwl.sum()) for sign in (1, -1)]
-    assert abs(float(gradient) - (ends[0] - ends[1]) / (2 * step)) < 0.05 * abs(float(gradient)) + 1e-3
+    after, before = (float(end.boxes().dimensions_hwl.sum()) for end in ends("mean"))
+    assert abs(float(gradient) - (after - before) / (2 * STEP)) < 0.05 * abs(float(gradient)) + 1e-3
 
 
 @pytest.mark.parametrize("mode", ["implicit", "unroll"])
@@ -180,7 +188,10 @@ def test_the_input_depth_counts_by_the_softness_of_the_contour_even_where_the_st
 
 
 # A shorter step of the gain drowns in what the ends are settled to; a longer one of the affine form ends elsewhere.
-@pytest.mark.parametrize(("brightness", "step", "tolerance"), [("gain", 3e-4, 0.06), ("affine", 1e-5, 0.08)])
+@pytest.mark.parametrize(
+    ("brightness", "step", "tolerance"),
+    [("gain", 3e-4, 0.06), pytest.param("affine", 1e-5, 0.08, marks=pytest.mark.long)],
+)
 def test_the_brightness_follows_the_images(
     inputs: StreetInputs, brightness: Literal["gain", "affine"], step: float, tolerance: float
 ) -> None:

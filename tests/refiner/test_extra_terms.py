@@ -76,8 +76,7 @@ def slope_of_heights() -> float:
     return float(heights(step, SETTLED) - heights(-step, SETTLED)) / (2 * step)
 
 
-@pytest.mark.parametrize("derived", [False, True])
-@pytest.mark.parametrize("mode", ["implicit", "unroll"])
+@pytest.mark.parametrize(("mode", "derived"), [("implicit", False), ("unroll", True)])
 def test_a_term_of_ones_own_carries_gradients(mode: str, derived: bool) -> None:
     metres = torch.zeros((), dtype=torch.float64, requires_grad=True)
     (gradient,) = torch.autograd.grad(heights(metres, with_mode(mode), derived), metres)

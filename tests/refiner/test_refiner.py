@@ -60,7 +60,7 @@ def assert_same(a: RefinementResult, b: RefinementResult, tolerance: float = 1e-
     torch.testing.assert_close(a.covariance, b.covariance, rtol=1e-6, atol=1e-12)
 
 
-@pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=["default", "paper"])
+@pytest.mark.parametrize("config", [DEFAULT, pytest.param(PAPER, marks=pytest.mark.long)], ids=["default", "paper"])
 def test_a_batch_of_frames_equals_a_loop_over_them(config: RefinerConfig) -> None:
     """Frames of different sizes: padding with arbitrary values must change nothing either."""
     frames, detections, parts = two_frames()
