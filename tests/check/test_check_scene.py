@@ -32,6 +32,12 @@ def demo() -> Scene:
     return scene(DEMO, DEMO / "detections" / "noisy_stereo", DEMO / "training" / "masks")
 
 
+@lru_cache(maxsize=1)
+def eight_frames(data: str, detections: str) -> Scene:
+    root = Path(str(DATA)) / data
+    return scene(root, root / "detections" / detections, root / "training" / "masks", 8)
+
+
 def test_the_bundled_frame_is_correct() -> None:
     report = check_scene(*demo())
     assert report.findings == ()
@@ -78,9 +84,7 @@ def test_correct_frames_raise_no_alarm(data: str, detections: str, masks: str) -
     "name", ["heading in degrees", "heading off by 180 degrees", "focal length 0.8 times too short"]
 )
 def test_mistakes_that_take_several_frames(name: str, data: str, detections: str) -> None:
-    root = Path(str(DATA)) / data
-    correct = scene(root, root / "detections" / detections, root / "training" / "masks", 8)
-    report = answer(MISTAKES[name], correct)
+    report = answer(MISTAKES[name], eight_frames(data, detections))
     assert named(MISTAKES[name], report), report
 
 

@@ -313,8 +313,13 @@ DATA = os.environ.get("DIRECTSHAPE_DATA")
 @pytest.mark.parametrize(
     ("layout", "root", "detections", "masks"),
     [
-        ("kitti", "rendered", "rendered/detections/mono", "rendered/masks_degraded"),
-        ("kitti", "kitti", "kitti/detections/noisy_stereo", "kitti/training/masks"),
+        *(
+            pytest.param("kitti", root, f"{root}/detections/{boxes}", f"{root}/{masks}", marks=pytest.mark.long)
+            for root, boxes, masks in (
+                ("rendered", "mono", "masks_degraded"),
+                ("kitti", "noisy_stereo", "training/masks"),
+            )
+        ),
         ("tracking", "kitti/tracking/0005", "kitti/tracking/0005/detections/pointrcnn", "kitti/tracking/0005"),
     ],
 )
