@@ -42,15 +42,6 @@ def test_an_unknown_key_names_the_nearest(mapping: dict[str, Any], nearest: str)
     assert str(error.value).endswith(f"the nearest known one is {nearest}")
 
 
-@pytest.mark.parametrize(
-    ("override", "cure"),
-    [],
-)
-def test_a_key_of_an_earlier_version_names_what_takes_its_place(override: str, cure: str) -> None:
-    with pytest.raises(ConfigError, match=cure):
-        load_config(None, [override])
-
-
 def test_where_none_is_near_an_unknown_key_names_all_of_its_group() -> None:
     with pytest.raises(ConfigError, match=r"unknown key solver\.qqq; known are initial_damping, .*, max_code"):
         config_from_mapping(RefinerConfig, {"solver": {"qqq": 1}})

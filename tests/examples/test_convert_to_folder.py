@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import runpy
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -72,9 +72,9 @@ def kitti() -> LoadedFrame:
 def folder(kitti: LoadedFrame, tmp_path_factory: pytest.TempPathFactory) -> Path:
     rig, folder = tmp_path_factory.mktemp("rig"), tmp_path_factory.mktemp("folder")
     write_rig(kitti, rig)
-    command = [sys.executable, str(EXAMPLE), "--rig", str(rig), "--out", str(folder)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("1 frames in")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [str(EXAMPLE), "--rig", str(rig), "--out", str(folder)])
+        runpy.run_path(str(EXAMPLE), run_name="__main__")
     return folder
 
 

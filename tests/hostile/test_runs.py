@@ -129,13 +129,6 @@ def test_frames_of_records_that_no_run_has_written(
     assert result_files(out) == result_files(undisturbed)
 
 
-@pytest.mark.parametrize("content", ["7", "[]", '{"schema_version": 1}', '{"schema_version": [[]]}'])
-def test_records_of_other_programs(shared_kitti: Path, tmp_path: Path, content: str) -> None:
-    (tmp_path / "summary.json").write_text(content)
-    with pytest.raises((DataFormatError, directshape_torch.ResumeError), match=r"summary\.json"):
-        refine(shared_kitti, tmp_path)
-
-
 def test_a_run_that_is_asked_to_end_says_so(tmp_path: Path) -> None:
     root, out = tmp_path / "kitti", tmp_path / "out"
     write_data_set(root, tuple(f"{number:06d}" for number in range(16)))

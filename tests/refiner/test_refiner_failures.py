@@ -26,7 +26,7 @@ from directshape_torch.errors import ConfigError, InputError
 from directshape_torch.geometry import se3
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.scene.detections import Detections, Occluders
+from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.status import Status
 
@@ -138,14 +138,6 @@ def test_a_car_without_a_pose_hides_no_other_by_its_depth() -> None:
     assert_others_unchanged(result)
 
 
-def test_a_tiny_car_is_left_alone_when_too_few_pixels_remain() -> None:
-    config = replace(DEFAULT, sampling=replace(DEFAULT.sampling, min_usable_pixels=100_000))
-    frames, detections = base()
-    result = refine(frames, detections, config)
-    assert result.status == [Status.too_few_pixels] * 2
-    assert torch.equal(result.T_cam_obj, detections.T_cam_obj)
-
-
 def test_a_left_mask_is_enough_and_a_right_one_alone_is_not() -> None:
     frames, detections = base()
     nobody = torch.zeros(2, dtype=torch.bool)
@@ -196,25 +188,6 @@ def test_a_nan_ground_plane_fails_its_own_frame_only() -> None:
     )
     assert result.status[2:] == [Status.non_finite] * 2
     torch.testing.assert_close(result.T_cam_obj[:2], healthy().T_cam_obj, rtol=0, atol=1e-10)
-
-
-@pytest.mark.parametrize("name", ["mask_left", "mask_right"])
-@pytest.mark.parametrize("factor", [10.0, 255.0])
-def test_masks_above_1_are_named(name: str, factor: float) -> None:
-    _, detections = base()
-    wrong = factor * getattr(detections, name).dense()
-    cure = "apply a sigmoid to logits, or divide by 255"
-    with pytest.raises(InputError, match=rf"^{name}: .* a value of {factor:g} in mask 0; {cure}"):
-        replace(detections, **{name: wrong})
-    occluders = Occluders(
-        detections.frame_index.int(),
-        detections.mask_left,
-        detections.mask_right,
-        detections.T_cam_obj[:, 2, 3],
-        detections.box_2d[:, 3],
-    )
-    with pytest.raises(InputError, match=rf"^{name}: .* a value of {factor:g} in mask 0"):
-        replace(occluders, **{name: wrong})
 
 
 def test_arguments_of_the_wrong_kind_are_named() -> None:
@@ -311,14 +284,6 @@ def test_no_cars(frames_too: bool) -> None:
     assert result.status == []
     assert result.boxes().dimensions_hwl.shape == (0, 3)
     assert result.covariance.shape == (0, 9, 9)
-
-
-def test_only_bad_cars() -> None:
-    frames, detections = base()
-    result = refine(frames, _no_mask(detections))
-    assert result.status == [Status.no_mask] * 2
-    assert result.covariance.isnan().all()
-    assert not result.refined.any()
 
 
 def test_a_car_that_is_not_refined_keeps_the_detectors_box_and_has_no_figures() -> None:

@@ -14,7 +14,7 @@ from directshape_torch.errors import InputError
 
 
 @pytest.mark.parametrize("counts", [
-    {"calls": 10, "faults": 40},
+    {"calls": 10, "faults": 100},
     pytest.param({"calls": 1000, "files": 1000, "kills": 4, "faults": 1}, marks=pytest.mark.long),
 ], ids=["few", "many"])  # fmt: skip
 def test_what_was_tried_finds_nothing_and_is_counted(
