@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO, Any
 from unittest import mock
 
-from helpers.output_folders import result_files
+from helpers.quick_runs import result_files
 
 from directshape_torch.batch.options import RunObserver
 from directshape_torch.errors import DirectShapeError

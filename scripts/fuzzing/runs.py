@@ -10,10 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from helpers.faulty_refiners import QuickRefiner
 from helpers.kitti_folder import write_data_set
-from helpers.output_folders import result_files
-from helpers.quick_runs import dataset
+from helpers.quick_runs import QuickRefiner, dataset, result_files
 
 from directshape_torch.batch.options import RefineOptions, RunObserver
 from directshape_torch.batch.refine_dataset import refine_dataset

@@ -8,10 +8,8 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.faulty_refiners import QuickRefiner
 from helpers.kitti_folder import FRAMES
-from helpers.output_folders import result_files
-from helpers.quick_runs import dataset, refine, refiner
+from helpers.quick_runs import QuickRefiner, dataset, refine, refiner, result_files
 
 from directshape_torch.batch.options import RunObserver
 from directshape_torch.batch.refine_dataset import refine_dataset

@@ -15,9 +15,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import quick_runs
-from helpers.faulty_refiners import QuickRefiner
 from helpers.kitti_folder import write_data_set
-from helpers.output_folders import result_files
+from helpers.quick_runs import QuickRefiner, result_files
 from numpy.typing import NDArray
 
 from directshape_torch.batch.engines import reports_of

@@ -18,8 +18,8 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import quick_runs
-from helpers.output_folders import result_files
-from helpers.run_fixtures import SIX_FRAMES as FRAMES
+from helpers.kitti_folder import SIX_FRAMES as FRAMES
+from helpers.quick_runs import result_files
 
 import directshape_torch
 from directshape_torch.batch.options import RefineOptions

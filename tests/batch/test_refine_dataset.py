@@ -8,10 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers.faulty_refiners import EVERY_RESULT
 from helpers.kitti_folder import CODE, FRAMES, PEDESTRIAN
-from helpers.output_folders import result_files
-from helpers.quick_runs import refine
+from helpers.quick_runs import EVERY_RESULT, refine, result_files
 
 from directshape_torch.batch.options import RefineOptions
 from directshape_torch.errors import InputError

@@ -6,10 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from helpers.faulty_refiners import FEW_STEPS
 from helpers.kitti_folder import FRAMES
-from helpers.output_folders import result_files
-from helpers.quick_runs import refine
+from helpers.quick_runs import FEW_STEPS, refine, result_files
 
 from directshape_torch.batch.resumption import join_summary
 from directshape_torch.errors import ResumeError

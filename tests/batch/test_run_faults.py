@@ -16,9 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import quick_runs
-from helpers.faulty_refiners import FEW_STEPS, QuickRefiner
-from helpers.output_folders import result_files
-from helpers.run_fixtures import SIX_FRAMES as FRAMES
+from helpers.kitti_folder import SIX_FRAMES as FRAMES
+from helpers.quick_runs import FEW_STEPS, QuickRefiner, result_files
 
 import directshape_torch
 from directshape_torch.batch.options import RefineOptions, RunObserver

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from helpers.kitti_folder import FRAMES
 from helpers.layouts import write_sequence, write_tracked
-from helpers.output_folders import result_files
-from helpers.quick_runs import refiner
+from helpers.quick_runs import refiner, result_files
 
 from directshape_torch.batch.frame_groups import track_windows
 from directshape_torch.batch.options import RefineOptions

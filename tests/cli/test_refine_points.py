@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.disparity_maps import write_disparity
-from helpers.kitti_folder import CODE, input_options, write_data_set
+from helpers.kitti_folder import CODE, input_options, write_data_set, write_disparity
 from helpers.synthetic_scene import TWO_CARS, street
 
 from directshape_torch.cli.main import main

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.disparity_maps import write_disparity
-from helpers.kitti_folder import CODE, input_options, write_data_set
+from helpers.kitti_folder import CODE, input_options, write_data_set, write_disparity
 from helpers.synthetic_scene import TWO_CARS, street
 
 from directshape_torch.cli.main import main

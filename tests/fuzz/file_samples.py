@@ -14,8 +14,7 @@ import cv2
 import numpy as np
 import torch
 import trimesh
-from helpers.disparity_maps import write_disparity
-from helpers.kitti_folder import FRAMES
+from helpers.kitti_folder import FRAMES, write_disparity
 from helpers.layouts import SEQUENCE, write_folder, write_raw, write_sequence
 from helpers.quick_runs import dataset, refine
 from helpers.shape_arrays import shape_arrays

@@ -7,14 +7,34 @@ from decimal import Decimal, localcontext
 
 import pytest
 import torch
-from helpers.twists import REGIMES, twists
 from kornia.geometry.liegroup import Se3, So3
+from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 
 AXIS = torch.tensor([0.6, -0.48, 0.64], dtype=torch.float64)
+REGIMES = ("uniform", "normal", "near_identity", "near_pi", "zero")
+
+
+def twists(regime: str, count: int = 40, dtype: torch.dtype = torch.float64) -> Tensor:
+    """Twists (count, 6) with rotation angles below pi."""
+    generator = torch.Generator().manual_seed(REGIMES.index(regime))
+    v = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    axis = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=-1)
+    uniform = torch.rand(count, 1, generator=generator, dtype=torch.float64)
+    if regime == "uniform":
+        omega = axis * uniform * (math.pi - 0.05)
+    elif regime == "normal":
+        omega = 0.3 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    elif regime == "near_identity":
+        v, omega = 1e-7 * v, axis * 1e-7
+    elif regime == "near_pi":
+        omega = axis * (math.pi - 10 ** (-6 * uniform - 1))
+    else:
+        v, omega = 0 * v, 0 * axis
+    return torch.cat([v, omega], dim=-1).to(dtype)
 
 
 @pytest.mark.parametrize("regime", REGIMES)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.files.atomic_files import write_png
@@ -17,6 +18,7 @@ from helpers.ellipsoids import ellipsoid_prior
 from helpers.synthetic_scene import TWO_CARS, Street, disturbed, street
 
 FRAMES = ("000000", "000001", "000002")
+SIX_FRAMES = tuple(f"{number:06d}" for number in range(6))
 PEDESTRIAN = "Pedestrian  -1 -1 0.50 1 20 9.0 60 1.80 0.60 0.60 -4.00 1.65 9.00 0.10 0.4"
 CODE = ((0.8, -0.5, 0.6), (-0.7, 0.4, 0.5))
 
@@ -55,6 +57,13 @@ def write_frame(root: Path, frame_id: str, scene: Street, detections: Detections
     scored = [f"{line} 0.{9 - k}" for k, line in enumerate(lines)]
     _write(root / "detections" / "data" / f"{frame_id}.txt", "\n".join([scored[0], PEDESTRIAN, *scored[1:]]) + "\n")
     _write(root / "masks" / f"{frame_id}.json", json.dumps(_masks(scene.detections)))
+
+
+def write_disparity(path: Path, disparity: NDArray[np.floating]) -> None:
+    """Write (H, W) pixels; NaN and values that are not positive become unknown, others are rounded to 1/256 pixel."""
+    known = np.isfinite(disparity) & (disparity > 0)
+    units = np.round(np.where(known, disparity, 0) * 256).clip(0, np.iinfo(np.uint16).max)
+    write_png(path, units.astype(np.uint16))
 
 
 def _lines(detections: Detections, t_cam_ref: Tensor) -> list[str]:

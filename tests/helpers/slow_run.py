@@ -9,7 +9,7 @@ from pathlib import Path
 from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.io.stereo_dataset import open_dataset
-from helpers.faulty_refiners import SlowRefiner
+from helpers.quick_runs import SlowRefiner
 
 
 def main(root: Path, out_dir: Path, ray: str | None = None) -> None:

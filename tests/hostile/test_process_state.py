@@ -18,8 +18,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers.faulty_refiners import EVERY_RESULT
-from helpers.quick_runs import dataset, refiner
+from helpers.quick_runs import EVERY_RESULT, dataset, refiner
 from helpers.synthetic_scene import cached_street
 
 from directshape_torch import DirectShapeRefiner, RigEstimate, check_scene, fit_shape, load_config

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 from helpers import quick_runs
 from helpers.kitti_folder import FRAMES, write_data_set
-from helpers.output_folders import result_files
+from helpers.quick_runs import result_files
 
 import directshape_torch
 from directshape_torch.batch.options import RunObserver

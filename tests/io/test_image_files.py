@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers.disparity_maps import write_disparity
+from helpers.kitti_folder import write_disparity
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_png

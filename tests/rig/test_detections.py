@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.faulty_refiners import EVERY_RESULT, IMAGES_ALONE
+from helpers.quick_runs import EVERY_RESULT, IMAGES_ALONE
 from helpers.synthetic_scene import masked
 from torch import Tensor
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.faulty_refiners import IMAGES_ALONE
+from helpers.quick_runs import IMAGES_ALONE
 from helpers.synthetic_scene import masked
 
 from directshape_torch.cli.demo import demo_dataset

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.faulty_refiners import IMAGES_ALONE
+from helpers.quick_runs import IMAGES_ALONE
 
 from directshape_torch.cli.demo import demo_dataset
 from directshape_torch.geometry import se3

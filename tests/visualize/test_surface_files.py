@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers.disparity_maps import write_disparity
 from helpers.finished_run import FinishedRun
+from helpers.kitti_folder import write_disparity
 from helpers.quick_runs import dataset
 from numpy.typing import NDArray
 from plyfile import PlyData
