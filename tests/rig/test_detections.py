@@ -18,6 +18,7 @@ from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
 from directshape_torch.rig.detections import observe_detections, size_error
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
+from directshape_torch.stereo_matching.disparity import with_disparity
 
 DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 DISPARITY, OFFSET, ROW_OFFSET = 2, 3, 5
@@ -144,7 +145,8 @@ def test_the_refiner_corrects_frames_by_its_rig(demo: LoadedFrame) -> None:
 def test_what_an_estimate_of_few_cars_says_gives_way_to_settings_and_points(demo: LoadedFrame) -> None:
     rig = RigEstimate.of_frames(demo.frame)
     rig.update(demo.frame, demo.detections)
-    frames, plain = rig.corrected(demo.frame), demo.detections
+    matched = with_disparity(demo.frame)
+    frames, plain = rig.corrected(matched), demo.detections
     informed = rig.informed(frames, plain)
     for config, heard in (
         (["priors.pose_sigma_yaw_deg=1"], replace(informed, pose_sigma=None)),
@@ -153,7 +155,7 @@ def test_what_an_estimate_of_few_cars_says_gives_way_to_settings_and_points(demo
     ):
         once = ["stages=[{max_iterations: 1}]", *EVERY_RESULT]
         settings = directshape_torch.load_config("fast", [*once, *config])
-        by_rig = DirectShapeRefiner(config=settings, rig=rig)(demo.frame, plain)
+        by_rig = DirectShapeRefiner(config=settings, rig=rig)(matched, plain)
         expected, other = (DirectShapeRefiner(config=settings)(frames, d) for d in (heard, informed))
         torch.testing.assert_close(by_rig.covariance, expected.covariance, rtol=0, atol=0, equal_nan=True)
         assert not bool(torch.isclose(by_rig.covariance, other.covariance).all())

@@ -133,6 +133,7 @@ def test_one_wall_cannot_tell_bias_from_way(tmp_path: Path) -> None:
         calibrate(tmp_path, tmp_path / "bias.json", "--camera-height", "0")
 
 
+@pytest.mark.long
 @pytest.mark.skipif(
     "DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA, the folder of KITTI frames, is not set"
 )

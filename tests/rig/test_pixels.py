@@ -158,6 +158,7 @@ def test_each_of_two_rigs_has_its_estimate_and_unknown_frames_are_refused(tmp_pa
         calibrate(tmp_path, "--frames", "000009")
 
 
+@pytest.mark.long
 @pytest.mark.skipif(
     "DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA, the folder of KITTI frames, is not set"
 )

@@ -123,7 +123,7 @@ def calm_drive() -> tuple[FrameBatch, Detections]:
     return joined_frames([view.frames for view in seen]), disturbed(detections, metres=0.05, radians=0.02)
 
 
-@pytest.mark.parametrize("next_view_weight", [0.15, 0.0])
+@pytest.mark.parametrize("next_view_weight", [0.15, pytest.param(0.0, marks=pytest.mark.long)])
 def test_two_cars_of_one_shape_are_told_apart_by_their_looks(next_view_weight: float) -> None:
     frames, detections = calm_drive()
     config = replace(DEFAULT, tracks=replace(DEFAULT.tracks, next_view_weight=next_view_weight))
@@ -167,11 +167,11 @@ def test_a_view_that_the_images_do_not_confirm_does_not_join() -> None:
     ("mode", "time_s", "doubted"),
     [
         ("unroll", None, ""),
-        ("unroll", None, "alone"),
+        pytest.param("unroll", None, "alone", marks=pytest.mark.long),
         ("unroll", (0, 0.1), "in_track"),
         ("implicit", None, "in_track"),
         ("implicit", (0, 0.1), "alone"),
-        ("implicit_gauss_newton", None, ""),
+        pytest.param("implicit_gauss_newton", None, "", marks=pytest.mark.long),
     ],
 )
 def test_gradients_of_a_track_are_those_of_differences(
