@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-import inspect
-import pkgutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from types import FunctionType, ModuleType
 from typing import Any
 
 import torch
@@ -17,7 +13,6 @@ from helpers.synthetic_scene import cached_street
 from inexact_numbers import Numbers, numbers
 from torch import Tensor
 
-import directshape_torch
 from directshape_torch import (
     Detections,
     DirectShapeRefiner,
@@ -37,15 +32,6 @@ from directshape_torch.geometry import box3d, box_formats, disparity_field, imag
 from directshape_torch.shape import pca_fit, zero_level
 from directshape_torch.shape.neural_prior import NeuralShapePrior
 from directshape_torch.shape.prior_file import PriorProvenance
-from directshape_torch.shape.sdf_grid import GridShape
-
-MODULES = (
-    "directshape_torch.evaluation.pose_error",
-    "directshape_torch.evaluation.rotated_iou",
-    "directshape_torch.shape.neural_prior",
-    "directshape_torch.shape.pca_fit",
-    "directshape_torch.shape.zero_level",
-)
 
 
 def rig(n: Numbers) -> tuple[Tensor, Tensor, Tensor]:
@@ -303,53 +289,3 @@ CASES: dict[str, Case] = {
     "RigEstimate.metres_per_pixel": lambda _: torch.tensor(estimate().metres_per_pixel(20.0), dtype=torch.float64),
     "RigEstimate.along_the_width": lambda _: estimate().along_the_width(),
 }  # fmt: skip
-
-
-# These compute nothing from tensors, or are what another one here calls.
-WITHOUT_NUMBERS = {
-    "BoxForm.order", "BoxForm.place", "Detections.has_mask_left", "Detections.has_mask_right",
-    "Detections.telling_rows", "DirectShapeRefiner.detector_sigmas", "DirectShapeRefiner.weighs_detector",
-    "MaskCrops.above", "MaskCrops.areas", "MaskCrops.at", "MaskCrops.box_2d", "MaskCrops.crop",
-    "MaskCrops.dense", "MaskCrops.extents", "MaskCrops.joined", "MaskCrops.none", "MaskCrops.of", "MaskCrops.of_boxes",
-    "MaskCrops.padded", "MaskCrops.rows", "MaskCrops.where", "box_formats.box_form", "box_formats.check_upright",
-    "image_boxes.enclosing_boxes",
-    "CheckReport.count", "CheckReport.exit_code", "DisparityField.check_rig", "DisparityField.rig", "DisparityField.to",
-    "Finding.block", "GridShape.curvature_along", "GridShape.derivatives", "GridShape.gradient",
-    "GridShape.minimum_along", "GridShape.of", "GridShape.sdf", "NeuralShapePrior.coded_layers",
-    "NeuralShapePrior.load",
-    "NeuralShapePrior.load_bundled", "NeuralShapePrior.save", "PCAShapePrior.get_extra_state", "PCAShapePrior.load",
-    "PCAShapePrior.load_bundled", "PCAShapePrior.num_codes", "PCAShapePrior.save", "PCAShapePrior.set_extra_state",
-    "RefinerConfig.fits_images", "RefinerConfig.fits_points",
-    "RefinementResult.refined", "RefinementResult.rows", "RefinementResult.status", "RefinementResult.to",
-    "RigEstimate.add_pixels", "RigEstimate.add_results", "RigEstimate.content", "RigEstimate.get_extra_state",
-    "RigEstimate.is_guess",
-    "RigEstimate.is_of", "RigEstimate.of_content", "RigEstimate.set_extra_state", "ShapeFit.arrays", "Status.code",
-    "Status.from_code", "Status.is_refined", "StereoCamera.num_frames",
-    "config_files.load_config",
-    "image_boxes.box_iou", "kornia_cameras.stereo_camera_of", "pose_error.boxes_of", "pose_error.errors_of",
-}  # fmt: skip
-
-
-def public_names() -> set[str]:
-    """Functions, and methods and properties of classes, that the package exports or these modules contain."""
-    inside = importlib.import_module("directshape_torch.geometry")
-    geometry = [each.name for each in pkgutil.iter_modules(inside.__path__, f"{inside.__name__}.")]
-    modules = [importlib.import_module(name) for name in (*geometry, *MODULES)]
-    found = [value for module in modules for value in vars(module).values() if _is_of(module, value)]
-    exported = [getattr(directshape_torch, name) for name in directshape_torch.__all__]
-    return {name for value in (*found, *exported, GridShape) for name in _names_of(value)}
-
-
-def _is_of(module: ModuleType, value: object) -> bool:
-    return getattr(value, "__module__", None) == module.__name__ and not value.__name__.startswith("_")
-
-
-def _names_of(value: Any) -> Iterator[str]:
-    """The name of a function after its module's, or of the members of a class after its own."""
-    if inspect.isfunction(value):
-        yield f"{value.__module__.rpartition('.')[2]}.{value.__name__}"
-    elif inspect.isclass(value) and not getattr(value, "_is_protocol", False) and not issubclass(value, Exception):
-        kinds = (FunctionType, property, classmethod, staticmethod)
-        for name, member in vars(value).items():
-            if not name.startswith("_") and isinstance(member, kinds):
-                yield f"{value.__name__}.{name}"

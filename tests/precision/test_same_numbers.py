@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from inexact_numbers import numbers
-from public_functions import CASES, WITHOUT_NUMBERS, public_names
+from public_functions import CASES
 from torch import Tensor
 
 HALF = (torch.bfloat16, pytest.param(torch.float16, marks=pytest.mark.long))
@@ -91,7 +91,3 @@ def test_whatever_dtype_pytorch_makes_by_default(name: str) -> None:
     with default_dtype(torch.bfloat16):
         found = CASES[name](numbers())
     assert_same(found, expected)
-
-
-def test_every_public_function_is_here() -> None:
-    assert sorted(public_names() - WITHOUT_NUMBERS) == sorted(CASES)
