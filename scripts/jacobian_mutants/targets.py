@@ -189,7 +189,7 @@ TARGETS: dict[str, Target] = {
     "short_axes": Target(
         "directshape_torch/numerics/tensors.py",
         ("length", "all_along"),
-        ("tests/geometry/test_short_axes.py",),
+        ("tests/numerics/test_tensors.py",),
     ),
     "bracket": Target(
         "directshape_torch/terms/depth.py",

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from directshape_torch.errors import InputError
-from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
+from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses, check_upright, poses_to_boxes
 
 # LiDAR (x forward, y left, z up) 0.3 m above and 0.2 m behind the camera.
@@ -87,23 +87,6 @@ def test_corners_are_read_in_each_tools_own_order(convention: BoxFormat) -> None
     torch.testing.assert_close(hwl, torch.tensor([HWL]).double(), atol=1e-6, rtol=0)
     rounded, _ = boxes_to_poses((corners * 100).round() / 100, convention, MOTION.get(convention))
     torch.testing.assert_close(rounded, expected(), atol=0.02, rtol=0)
-
-
-def test_openpcdets_box_has_these_corners_by_hand() -> None:
-    """A car that drives to the left of the LiDAR: its front is 2 m farther left, its right side 0.8 m farther ahead."""
-    boxes = torch.tensor([[20.0, 3.0, -1.0, 4.0, 1.6, 1.5, math.pi / 2]], dtype=torch.float64)
-    T_lidar_obj, hwl = boxes_to_poses(boxes, "openpcdet", torch.eye(4))
-    corners = box_corners(T_lidar_obj, hwl)[0]
-    front_left, front_right, rear_right = [19.2, 5.0, -1.75], [20.8, 5.0, -1.75], [20.8, 1.0, -1.75]
-    torch.testing.assert_close(corners[:3], torch.tensor([front_left, front_right, rear_right]).double())
-    torch.testing.assert_close(corners[4:, 2], torch.full((4,), -0.25).double())
-
-
-def test_openpcdet_and_mmdetection3d_differ_by_half_a_height() -> None:
-    box = torch.tensor([WRITTEN["mmdet3d_lidar"]], dtype=torch.float64)
-    raised = box + box.new_tensor([0, 0, 0.75, 0, 0, 0, 0])
-    poses = [boxes_to_poses(*given, T_CAM_LIDAR)[0] for given in ((box, "mmdet3d_lidar"), (raised, "openpcdet"))]  # type: ignore[arg-type]
-    torch.testing.assert_close(*poses)
 
 
 # The same order and axes, or corners that make another standing box in the other frame.

@@ -89,17 +89,6 @@ def test_left_jacobian_of_the_exponential(angle: float) -> None:
     torch.testing.assert_close(torch.func.jacfwd(se3.exp)(twist), expected, rtol=1e-10, atol=1e-10)
 
 
-def test_coefficients_of_the_series(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where they are used a wrong last term would be below rounding, so they are tried where it is large."""
-    monkeypatch.setattr(se3, "_SERIES_ANGLE_SQUARED", 10.0)
-    t = torch.tensor([9.0, 5.0], dtype=torch.float64)
-    angle = t.sqrt()
-    b, c = se3._higher_exp_coefficients(t[:, None], math.inf).unbind(-1)
-    # First terms left out: t^7 / 16!, t^7 / 17!.
-    torch.testing.assert_close(b, (1 - angle.cos()) / t, atol=2.3e-7, rtol=0)
-    torch.testing.assert_close(c, (angle - angle.sin()) / (t * angle), atol=1.4e-8, rtol=0)
-
-
 def test_the_series_is_exact_where_it_is_used() -> None:
     """Against the closed forms, with more digits than float64 has."""
     t = se3._SERIES_ANGLE_SQUARED

@@ -1,4 +1,4 @@
-"""Constants are right in every mode, whichever mode asked first."""
+"""Constants are right in every mode, whichever mode asked first, and lengths and joined flags are PyTorch's own."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from directshape_torch.numerics.tensors import constant_like, made_once
+from directshape_torch.numerics.tensors import all_along, constant_like, length, made_once
 
 
 class Constants:
@@ -99,3 +99,23 @@ def test_constants_of_another_type_are_others() -> None:
     constants = Constants(5.0)
     for dtype in (torch.float64, torch.float32):
         assert [x.dtype for x in constants.of(torch.ones(1, dtype=dtype))] == [dtype, dtype]
+
+
+@pytest.mark.parametrize("dim", [0, 1, -1])
+def test_length_is_the_euclidean_norm(dim: int) -> None:
+    vectors = torch.randn(3, 4, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(length(vectors, dim), vectors.norm(dim=dim), rtol=1e-14, atol=0)
+
+
+def test_length_has_the_derivative_of_the_norm() -> None:
+    vectors = torch.randn(3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: length(x, dim=0), vectors)
+
+
+@pytest.mark.parametrize("dim", [0, 1, -1])
+def test_all_along_is_all(dim: int) -> None:
+    flags = torch.rand(4, 8, 5, generator=torch.Generator().manual_seed(0)) > 0.2
+    together = all_along(flags, dim)
+    assert torch.equal(together, flags.all(dim=dim))
+    assert together.any()
+    assert not together.all()
