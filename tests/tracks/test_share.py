@@ -168,7 +168,7 @@ def test_a_view_that_the_images_do_not_confirm_does_not_join() -> None:
     [
         ("unroll", None, ""),
         pytest.param("unroll", None, "alone", marks=pytest.mark.long),
-        ("unroll", (0, 0.1), "in_track"),
+        pytest.param("unroll", (0, 0.1), "in_track", marks=pytest.mark.long),
         ("implicit", None, "in_track"),
         ("implicit", (0, 0.1), "alone"),
         pytest.param("implicit_gauss_newton", None, "", marks=pytest.mark.long),
