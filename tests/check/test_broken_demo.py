@@ -10,15 +10,14 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from helpers.bundled_frame import DEMO
 from helpers.matched_once import matched_once
 
-import directshape_torch
 from directshape_torch.check.check_dataset import check_dataset
 from directshape_torch.check.finding import CheckReport
 from directshape_torch.cli.main import main
 from directshape_torch.io.stereo_dataset import open_dataset
 
-DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 Break = Callable[[Path], object]  # changes the files below a root with `training` and `detections`
 # Folders and files of the one frame.
 LEFT, RIGHT, CALIBRATION = "training/image_2/000000.png", "training/image_3/000000.png", "training/calib/000000.txt"

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.bundled_frame import BOXES, DEMO
 from helpers.matched_once import matched_once
 from numpy.typing import NDArray
 
-import directshape_torch
 from directshape_torch import check_scene
 from directshape_torch.check.check_dataset import check_dataset
 from directshape_torch.check.finding import CheckReport
@@ -24,7 +24,6 @@ from directshape_torch.io.stereo_dataset import StereoDataset, open_dataset
 from directshape_torch.io.velodyne import read_points
 from directshape_torch.stereo_matching.disparity import match_disparity
 
-DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 PLACE = "R0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: 0 -1 0 0.05 0 0 -1 -0.1 1 0 0 -0.3\n"
 Points = NDArray[np.float32]
 
@@ -40,7 +39,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Points]:
     """The bundled frame with the pose of a scanner, and stereo points (P, 4) in the scanner's frame."""
     root = tmp_path_factory.mktemp("demo")
     shutil.copytree(DEMO / "training", root / "training")
-    shutil.copytree(DEMO / "detections" / "noisy_stereo", root / "detections")
+    shutil.copytree(BOXES, root / "detections")
     with (root / "training" / "calib" / "000000.txt").open("a") as file:
         file.write(PLACE)
     files = dataset(root).layout.files("000000")

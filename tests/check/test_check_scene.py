@@ -10,13 +10,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.bundled_frame import BOXES, DEMO, MASKS
 from scene_mistakes import MISTAKES, Scene, answer, named, scene
 
-import directshape_torch
 from directshape_torch import DirectShapeRefiner, check_scene, load_config
 from directshape_torch.errors import SceneWarning
 
-DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 DATA = os.environ.get("DIRECTSHAPE_DATA")
 needs_data = pytest.mark.skipif(DATA is None, reason="DIRECTSHAPE_DATA is not set")
 # One frame of six cars: what is seen in the image is seen here, headings of cars all along the street are not.
@@ -29,7 +28,7 @@ OF_ONE_FRAME = sorted(
 
 @lru_cache(maxsize=1)
 def demo() -> Scene:
-    return scene(DEMO, DEMO / "detections" / "noisy_stereo", DEMO / "training" / "masks")
+    return scene(DEMO, BOXES, MASKS)
 
 
 @lru_cache(maxsize=1)

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from helpers.bundled_frame import DEMO
 from numpy.typing import NDArray
 
-import directshape_torch
 from directshape_torch.check.check_tones import check_tones
 from directshape_torch.io.image_files import read_pair
 
 Image = NDArray[np.uint8]
-TRAINING = Path(directshape_torch.__file__).parent / "assets" / "demo" / "training"
 
 
 def demo() -> tuple[Image, Image]:
-    left, right = (next((TRAINING / folder).glob("000000.*")) for folder in ("image_2", "image_3"))
+    left, right = (next((DEMO / "training" / folder).glob("000000.*")) for folder in ("image_2", "image_3"))
     return read_pair(left, right)
 
 

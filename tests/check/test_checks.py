@@ -12,10 +12,10 @@ from typing import get_args
 import numpy as np
 import pytest
 import torch
+from helpers.bundled_frame import DEMO, LABELS, MASKS
 from helpers.layouts import write_folder
 from numpy.typing import NDArray
 
-import directshape_torch
 from directshape_torch.check import check_dataset as module
 from directshape_torch.check.check_dataset import check_dataset
 from directshape_torch.check.check_images import PairMatches, check_calibration, check_pair
@@ -287,14 +287,11 @@ def test_command(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
         check_dataset(open_dataset("kitti", kitti, kitti / "detections"), 0)
 
 
-DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
-
-
 @pytest.mark.parametrize(("bias_px", "expected"), [(0.0, []), (1.5, ["rig_offset"])])
 def test_a_field_that_the_cars_contradict(bias_px: float, expected: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """The bundled frame is exact, so a field of 1.5 px is what is wrong; it has six cars."""
     monkeypatch.setattr(module, "_FEWEST_CARS", 4)
-    dataset = open_dataset("kitti", DEMO, DEMO / "training" / "label_2", DEMO / "training" / "masks")
+    dataset = open_dataset("kitti", DEMO, LABELS, MASKS)
     frame = dataset.load("000000").frame
     height, width = frame.sizes[0].tolist()
     matrices = (frame.camera.K_left[0], frame.camera.K_right[0], frame.camera.T_right_cam[0])

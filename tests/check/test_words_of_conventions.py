@@ -6,19 +6,17 @@ import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from itertools import product
-from pathlib import Path
 from typing import NamedTuple, get_args
 
 import pytest
 import torch
+from helpers.bundled_frame import BOXES, DEMO, MASKS
 from scene_mistakes import Scene, scene
 from torch import Tensor
 
-import directshape_torch
 from directshape_torch import CheckReport, Detections, InputError, check_scene
 from directshape_torch.geometry.box_formats import BoxFormat, box_form, poses_to_boxes
 
-DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 T_CAM_LIDAR = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, -0.1], [1, 0, 0, -0.2], [0, 0, 0, 1]])
 T_CAM_TOP = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1, -0.1], [0, 1, 0, -0.2], [0, 0, 0, 1]])
 CONVENTIONS: tuple[BoxFormat, ...] = get_args(BoxFormat)
@@ -33,7 +31,7 @@ FOREIGN = ("rotation_y", "P2", "P3", "--classes", "--split", "category_id")
 
 @lru_cache(maxsize=1)
 def demo() -> Scene:
-    return scene(DEMO, DEMO / "detections" / "noisy_stereo", DEMO / "training" / "masks")
+    return scene(DEMO, BOXES, MASKS)
 
 
 def said_of(convention: BoxFormat, change: Callable[[Tensor, BoxFormat], Tensor], T: Tensor | None) -> CheckReport:

@@ -9,15 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.bundled_frame import BOXES, DEMO, LABELS, MASKS
 
-import directshape_torch
 from directshape_torch.cli.main import main
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.rig.rig_file import load_rigs
 
-DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 QUICK = ("--set", "stages=[{max_iterations: 3, image_level: 1}]", "--device", "cpu")
 SKY = {"image": "left", "category_id": 3, "score": 0.9, "segmentation": [[300, 5, 420, 5, 420, 60, 300, 60]]}
 
@@ -26,7 +25,7 @@ SKY = {"image": "left", "category_id": 3, "score": 0.9, "segmentation": [[300, 5
 def masks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The masks of the demo, and one of the sky, which comes first."""
     folder = tmp_path_factory.mktemp("masks")
-    entries = json.loads((DEMO / "training" / "masks" / "000000.json").read_text())
+    entries = json.loads((MASKS / "000000.json").read_text())
     (folder / "000000.json").write_text(json.dumps([SKY, *entries]))
     return folder
 
@@ -52,15 +51,15 @@ def test_each_mask_has_a_line(run: Path) -> None:
     assert shapes.statuses[0] == "no_start"
     assert set(shapes.statuses[1:]) <= {"converged", "max_iterations"}
     assert np.isnan(shapes.probabilities_better).all()
-    bbox = json.loads((DEMO / "training" / "masks" / "000000.json").read_text())[0]["bbox"]
+    bbox = json.loads((MASKS / "000000.json").read_text())[0]["bbox"]
     assert lines[1].box_2d[:2] == tuple(bbox[:2])
     assert RunFolder(run).read("000000").record.masks_right == 6
     assert shapes.statuses.count("no_start") == 1
 
 
 def test_results_are_near_the_truth(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    labels, table = DEMO / "training" / "label_2", tmp_path / "cars.csv"
-    assert main(["compare", "--labels", str(labels), "--after", str(run), "--csv", str(table)]) == 0
+    table = tmp_path / "cars.csv"
+    assert main(["compare", "--labels", str(LABELS), "--after", str(run), "--csv", str(table)]) == 0
     printed = capsys.readouterr().out
     assert "6 detections of 6 counted labels" in printed
     assert "before" not in printed
@@ -83,7 +82,7 @@ def test_a_run_goes_on_and_is_not_one_with_boxes(
     assert line.endswith(" cars (kept)")
     assert "detector" not in printed.out
     assert (out / "rig.png").is_file()
-    boxes = ["--detections", str(DEMO / "detections" / "noisy_stereo")]
+    boxes = ["--detections", str(BOXES)]
     assert main(["refine", *inputs(masks), *boxes, "--rig", "none", "--out", str(out), *QUICK]) == 2
     assert "boxes" in capsys.readouterr().err
 

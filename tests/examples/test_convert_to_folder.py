@@ -15,16 +15,15 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers.bundled_frame import BOXES, DEMO, MASKS
 from helpers.layouts import put
 
-import directshape_torch
 from directshape_torch.check.check_dataset import check_dataset
 from directshape_torch.cli.main import main
 from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.io.kitti_labels import poses_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
 
-DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 EXAMPLE = Path(__file__).parents[2] / "examples" / "convert_to_folder.py"
 
 
@@ -55,7 +54,7 @@ def write_rig(demo: LoadedFrame, root: Path) -> None:
             }
         )
     (root / "boxes.json").write_text(json.dumps({"street": boxes}))
-    masks = json.loads((DEMO / "training" / "masks" / "000000.json").read_text())
+    masks = json.loads((MASKS / "000000.json").read_text())
     for mask in masks:
         # Instances 1001 .. 1006 are the cars in the order of the detections.
         mask["box"] = mask["instance_id"] - 1001 if mask["instance_id"] <= 1006 else -1
@@ -64,8 +63,7 @@ def write_rig(demo: LoadedFrame, root: Path) -> None:
 
 @pytest.fixture(scope="module")
 def kitti() -> LoadedFrame:
-    detections, masks = DEMO / "detections" / "noisy_stereo", DEMO / "training" / "masks"
-    return open_dataset("kitti", DEMO, detections, masks, dtype=torch.float64).load("000000")
+    return open_dataset("kitti", DEMO, BOXES, MASKS, dtype=torch.float64).load("000000")
 
 
 @pytest.fixture(scope="module")

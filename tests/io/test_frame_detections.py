@@ -7,27 +7,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.demo_masks import demo as demo_with_boxes
-from helpers.demo_masks import with_mirror_image
+from helpers.bundled_frame import DEMO, MASKS, with_mirror_image, with_true_boxes
+from helpers.bundled_frame import demo as demo_with_boxes
 from helpers.layouts import write_odometry, write_raw, write_sequence
 
-import directshape_torch
 from directshape_torch.errors import InputError
 from directshape_torch.io.frame_detections import detections_of_masks
 from directshape_torch.io.instance_masks import InstanceMask
 from directshape_torch.io.stereo_dataset import LayoutName, LoadedFrame, open_dataset
 
-DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 FRAMES = ("000000", "000001")
 
 
 @pytest.fixture(scope="module")
 def demo() -> LoadedFrame:
-    return open_dataset("kitti", DEMO, masks=DEMO / "training" / "masks").load("000000")
+    return open_dataset("kitti", DEMO, masks=MASKS).load("000000")
 
 
 def masks_of_demo(loaded: LoadedFrame) -> list[InstanceMask]:
-    dataset = open_dataset("kitti", DEMO, masks=DEMO / "training" / "masks")
+    dataset = open_dataset("kitti", DEMO, masks=MASKS)
     assert dataset.masks is not None
     height, width = loaded.frame.images_left.shape[2:]
     return dataset.masks.read("000000", (height, width))
@@ -46,8 +44,7 @@ def test_right_masks_belong_to_the_left_ones(demo: LoadedFrame) -> None:
     shuffled = sorted(masks, key=lambda mask: (mask.side, -mask.instance_id if mask.side == "right" else 0))
     found, _ = detections_of_masks(shuffled, demo.frame)
     assert found.detections.mask_right.dense().equal(demo.detections.mask_right.dense())
-    with_boxes = open_dataset("kitti", DEMO, DEMO / "training" / "label_2", DEMO / "training" / "masks").load("000000")
-    assert demo.detections.mask_right.dense().equal(with_boxes.detections.mask_right.dense())
+    assert demo.detections.mask_right.dense().equal(with_true_boxes().detections.mask_right.dense())
 
 
 def test_left_masks_suffice_and_others_hide(demo: LoadedFrame) -> None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
+from helpers.bundled_frame import with_true_boxes
 from helpers.quick_runs import EVERY_RESULT, IMAGES_ALONE
 from helpers.synthetic_scene import masked
 from torch import Tensor
@@ -14,13 +14,12 @@ from torch import Tensor
 import directshape_torch
 from directshape_torch import DirectShapeRefiner, RigEstimate, check_scene
 from directshape_torch.errors import InputError
-from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.rig.detections import observe_detections, size_error
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.stereo_matching.disparity import with_disparity
 
-DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 DISPARITY, OFFSET, ROW_OFFSET = 2, 3, 5
 POINTS_ALONE = (
     "silhouette.weight=0",
@@ -33,7 +32,7 @@ POINTS_ALONE = (
 @pytest.fixture(scope="module")
 def demo() -> LoadedFrame:
     """The six cars with their true boxes."""
-    return open_dataset("kitti", DEMO, DEMO / "training" / "label_2", DEMO / "training" / "masks").load("000000")
+    return with_true_boxes()
 
 
 def warped(frames: FrameBatch, disparity_px: float, rows_px: float) -> FrameBatch:

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.bundled_frame import DEMO, MASKS
 from helpers.rig_rows import SIZE_WH, estimate, rows_of_cars
-from test_detections import DEMO, OFFSET, closer, difference, warped
+from test_detections import OFFSET, closer, difference, warped
 
 from directshape_torch import Detections, RigEstimate
 from directshape_torch.geometry.disparity_field import polynomial_basis
@@ -28,7 +29,7 @@ SIZE_NOISE = 0.06
 @pytest.fixture(scope="module")
 def demo() -> LoadedFrame:
     """Six rendered cars with exact masks, and boxes that were made of these."""
-    return open_dataset("kitti", DEMO, masks=DEMO / "training" / "masks").load("000000")
+    return open_dataset("kitti", DEMO, masks=MASKS).load("000000")
 
 
 def cut(detections: Detections, rows: slice) -> Detections:
@@ -116,7 +117,7 @@ def test_files_keep_sizes_and_earlier_files_have_none(tmp_path: Path) -> None:
 
 
 def test_a_rig_of_files_without_detections_is_estimated_from_sizes(demo: LoadedFrame) -> None:
-    (rig,) = estimate_rigs(open_dataset("kitti", DEMO, masks=DEMO / "training" / "masks", ground="camera_height"))
+    (rig,) = estimate_rigs(open_dataset("kitti", DEMO, masks=MASKS, ground="camera_height"))
     expected = RigEstimate.of_frames(demo.frame)
     expected.update(demo.frame, demo.detections)
     assert len(rig.sizes) == len(expected.sizes) > 0

@@ -8,11 +8,9 @@ import calibrate_heading
 import numpy as np
 import pytest
 from calibrate_heading import Cars, difference_of, fitted, probability, reliability
+from helpers.bundled_frame import DEMO, MASKS
 
-import directshape_torch
 from directshape_torch.cli.main import main as directshape
-
-DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 
 
 def cars(root: str, scale: float, count: int = 4000) -> Cars:
@@ -37,7 +35,7 @@ def test_the_table_has_predicted_beside_true_shares() -> None:
 
 
 def test_the_demo_from_its_masks_is_judged(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    masks = ["--masks", str(DEMO / "training" / "masks")]
+    masks = ["--masks", str(MASKS)]
     assert directshape(["refine", "--data", str(DEMO), *masks, "--out", str(tmp_path / "run")]) == 0
     assert calibrate_heading.main(["--run", str(DEMO), str(tmp_path / "run")]) == 0
     assert "| demo run | " in capsys.readouterr().out.splitlines()[-1]

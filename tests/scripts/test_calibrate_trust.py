@@ -8,15 +8,13 @@ from pathlib import Path
 import calibrate_trust
 import numpy as np
 import pytest
+from helpers.bundled_frame import DEMO, MASKS
 from trust_calibration.cars import Cars, Judged
 from trust_calibration.fit import fit_head, logistic, most_likely
 
-import directshape_torch
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.refinement.trust import EVIDENCE_NAMES, ImageNoise, LogisticHead, TrustModel, trust_model_of
-
-DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 
 
 def test_factor_and_floor_are_found_again() -> None:
@@ -62,8 +60,7 @@ def test_boxes_with_the_mask_of_a_neighbour_count_where_they_come_back_worse() -
 
 
 def test_cars_of_the_demo_are_judged(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    masks = str(DEMO / "training" / "masks")
-    cars = ["--cars", str(DEMO), "stereo", masks, "--draws", "2", "--workers", "1", "--out", str(tmp_path)]
+    cars = ["--cars", str(DEMO), "stereo", str(MASKS), "--draws", "2", "--workers", "1", "--out", str(tmp_path)]
     # The demo has one frame, and so nothing elsewhere: the model of the package says what is there.
     assert calibrate_trust.main(cars) == 0
     lines = capsys.readouterr().out.splitlines()

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
 import wrong_boxes as script
+from helpers.bundled_frame import BOXES, DEMO, MASKS
 
-import directshape_torch
 from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
-
-DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 
 
 def test_cars_turn_about_themselves_and_move_along_their_rays() -> None:
@@ -27,8 +24,8 @@ def test_a_row_tells_how_many_cars_were_found(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(script, "WRONG", {"turned": script.turned(90.0)})
-    data = ["--data", str(DEMO), "--detections", str(DEMO / "detections" / "noisy_stereo")]
-    assert script.main([*data, "--masks", str(DEMO / "training" / "masks"), "--search", "off", "rescue"]) == 0
+    data = ["--data", str(DEMO), "--detections", str(BOXES)]
+    assert script.main([*data, "--masks", str(MASKS), "--search", "off", "rescue"]) == 0
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in capsys.readouterr().out.splitlines()[2:]]
     assert [row[:3] for row in rows[:2]] == [["turned", "off", "6"], ["turned", "rescue", "6"]]
     assert int(rows[0][5]) == 0

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.demo_masks import demo, masks, started
+from helpers.bundled_frame import demo, masks, started
 from torch import Tensor
 
 from directshape_torch import Detections, DirectShapeRefiner, InputError, Status

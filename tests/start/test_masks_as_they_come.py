@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.demo_masks import demo, masks, started, with_mirror_image
+from helpers.bundled_frame import demo, masks, started, with_mirror_image
 from torch import Tensor
 
 from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, Status

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
+from helpers.bundled_frame import with_true_boxes
 from helpers.problems import DEFAULT
 from helpers.synthetic_scene import cached_street, disturbed
 from torch import Tensor
 
-import directshape_torch
 from directshape_torch import Detections, DirectShapeRefiner, RigEstimate, Status, check_scene
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.io.frame_collation import collate
-from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.rig.detections import observe_detections
 
-DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
-MASKS = DEMO / "training" / "masks"
 TOGETHER = replace(DEFAULT, priors=replace(DEFAULT.priors, detector_weight=1.0))
 
 
@@ -30,7 +27,7 @@ def marked(detections: Detections, rows: Tensor) -> Detections:
 
 @pytest.fixture(scope="module")
 def demo() -> LoadedFrame:
-    return open_dataset("kitti", DEMO, DEMO / "training" / "label_2", MASKS).load("000000")
+    return with_true_boxes()
 
 
 @pytest.fixture(scope="module")

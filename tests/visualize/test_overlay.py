@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from helpers.bundled_frame import BOXES, DEMO, MASKS
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.synthetic_scene import cached_street, disturbed, joined_frames
 
-import directshape_torch
 from directshape_torch import (
     Detections,
     DirectShapeRefiner,
@@ -131,9 +130,7 @@ def test_tensors_of_a_call_are_drawn_where_their_cars_are() -> None:
 
 def test_tensors_and_files_give_the_same_picture() -> None:
     """But for the line numbers of the file, which are those of the rows here, and the truth from above."""
-    root = Path(directshape_torch.__file__).parent / "assets" / "demo"
-    dataset = open_dataset("kitti", root, root / "detections" / "noisy_stereo", root / "training" / "masks")
-    loaded = dataset.load("000000")
+    loaded = open_dataset("kitti", DEMO, BOXES, MASKS).load("000000")
     numbers = dict(zip(loaded.row_of_detection, range(len(loaded.detections)), strict=True))
     objects = [replace(one, line_number=numbers.get(row, 99)) for row, one in enumerate(loaded.input_objects)]
     loaded = replace(loaded, input_objects=tuple(objects), labels=None)

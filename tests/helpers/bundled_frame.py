@@ -1,9 +1,9 @@
-"""The bundled frame with its true boxes, and start boxes made of its masks."""
+"""The folders of the bundled frame, the frame with its true boxes, and start boxes made of its masks."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 from torch import Tensor
@@ -14,12 +14,19 @@ from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
 from directshape_torch.stereo_matching.disparity import with_disparity
 
 DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
+BOXES, LABELS, MASKS = DEMO / "detections" / "noisy_stereo", DEMO / "training" / "label_2", DEMO / "training" / "masks"
 
 
-@lru_cache(maxsize=1)
+@cache
+def with_true_boxes() -> LoadedFrame:
+    """The six cars with their true boxes."""
+    return open_dataset("kitti", DEMO, LABELS, MASKS).load("000000")
+
+
+@cache
 def demo() -> LoadedFrame:
     """The six cars with their true boxes, and frames that have been matched."""
-    loaded = open_dataset("kitti", DEMO, DEMO / "training" / "label_2", DEMO / "training" / "masks").load("000000")
+    loaded = with_true_boxes()
     return replace(loaded, frame=with_disparity(loaded.frame))
 
 
