@@ -11,7 +11,6 @@ import torch
 from benchmark_suites.workloads import demo_scene
 from helpers.car_counts import with_cars
 from torch import Tensor
-from torch._dynamo.utils import counters
 
 from directshape_torch.compile import check_compiler, compilable, compiling
 from directshape_torch.errors import CompilationError
@@ -29,6 +28,8 @@ CPU = torch.device("cpu")
 @pytest.mark.parametrize("name", ["prior", pytest.param("photometric", marks=pytest.mark.long)])
 @torch.no_grad()
 def test_a_term_of_five_cars_has_its_plain_values(name: str) -> None:
+    from torch._dynamo.utils import counters
+
     problem, state = DirectShapeRefiner(config=load_config()).problem(*with_cars(demo_scene().frames, 5))
     state = state.unknowns.retract(state, torch.full((5, state.unknowns.size), 0.02))
     with without_kernels():
