@@ -74,7 +74,10 @@ def test_schema_and_damage(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace('"schema_version": 3', '"schema_version": 9'))
     with pytest.raises(ResumeError, match="schema version is 9, this program writes 3"):
         read_manifest(path)
-    for content in ("{", "[]", "{}", '{"schema_version": 3, "x": 2}'):
+    path.write_text('{"schema_version": [[]]}')
+    with pytest.raises(ResumeError, match=r"schema version is \[\[\]\], this program writes 3"):
+        read_manifest(path)
+    for content in ("{", "7", "[]", "{}", '{"schema_version": 3, "x": 2}'):
         path.write_text(content)
         with pytest.raises(DataFormatError, match=r"summary\.json: .*(no summary|valid JSON|'x' is unknown)"):
             read_manifest(path)
