@@ -12,7 +12,6 @@ from directshape_torch.numerics.tables import Chosen, take_rows
 from directshape_torch.refinement.make_result import at_states, judged, result_of
 from directshape_torch.refinement.problem import CarMinimum, CarProblem
 from directshape_torch.refinement.result import RefinementResult
-from directshape_torch.solver.differentiate import implicit_state, unrolled_state
 from directshape_torch.solver.gauss_newton import minimise
 from directshape_torch.solver.problem import put_rows, where_rows
 from directshape_torch.state.cars import CarBatch
@@ -65,6 +64,9 @@ class Refined(Generic[AnyState]):
         wanted = is_refined(minimum.status)
         if not torch.is_grad_enabled() or not bool(wanted.any()):
             return minimum.state
+        # The import stands here, because only gradients need it.
+        from directshape_torch.solver.differentiate import implicit_state, unrolled_state
+
         chosen = Chosen.where(wanted)
         part, rows = self.problem.of(chosen), chosen.index
         backward, names = self.problem.config.backward, self.cars.detection_row
