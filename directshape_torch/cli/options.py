@@ -222,8 +222,8 @@ def add_run_inputs(group: argparse._ActionsContainer, needed_for: str) -> None:
 def dataset_of_run(args: argparse.Namespace, run: RunFolder) -> StereoDataset | None:
     """The chosen frames of a run; None without `--data`."""
     if args.data is None:
-        names = ("detections", "masks", "masks_left", "masks_right", "disparity", "rig")
-        given = [f"--{name.replace('_', '-')}" for name in names if getattr(args, name, None) not in (None, "none")]
+        names = ("detections", "masks", "masks_left", "masks_right", "rig")
+        given = [f"--{name.replace('_', '-')}" for name in names if getattr(args, name) not in (None, "none")]
         if given:
             raise InputError("--data", f"the data set of the run, because of {', '.join(given)}", "nothing")
         return None
@@ -240,7 +240,6 @@ def dataset_of_run(args: argparse.Namespace, run: RunFolder) -> StereoDataset | 
         ground=run.setting("ground"),
         camera_height_m=run.setting("camera_height_m"),
         disparity_field=_fields_of_run(args.rig, run),
-        disparity_dir=getattr(args, "disparity", None),
     )
 
 

@@ -13,10 +13,9 @@ from directshape_torch.files.atomic_files import check_folder, write_bytes, writ
 from directshape_torch.files.read_files import read_bytes
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.run_folder import FrameResult, result_path
-from directshape_torch.visualize.frame_source import Exporter, ExportOptions, FrameSource
 from directshape_torch.visualize.rerun_recording import RerunExporter
-from directshape_torch.visualize.run_frames import RunInputs
-from directshape_torch.visualize.surface_files import GlbExporter, PlyExporter, PointsExporter
+from directshape_torch.visualize.run_frames import Exporter, RunFrame, RunInputs
+from directshape_torch.visualize.surface_files import GlbExporter, PlyExporter
 
 _KITTI_FRAME = "ref: KITTI's rectified camera 0, x right, y down, z forward, metres and radians"
 
@@ -24,15 +23,15 @@ _KITTI_FRAME = "ref: KITTI's rectified camera 0, x right, y down, z forward, met
 class KittiExporter(Exporter):
     """A `KittiExporter` copies `kitti/data/NNNNNN.txt` unchanged and writes its lines as `kitti/json/NNNNNN.json`."""
 
-    def add(self, source: FrameSource) -> None:
-        frame, frame_id, folder = source.result, source.frame_id, self.folder / "kitti"
+    def add(self, frame: RunFrame) -> None:
+        result, frame_id, folder = frame.result, frame.frame_id, self.folder / "kitti"
         write_bytes(folder / "data" / f"{frame_id}.txt", read_bytes(result_path(self.inputs.run.path, frame_id)))
         content = {
             "schema": "directshape kitti results",
             "schema_version": 1,
             "frame_id": frame_id,
             "coordinates": _KITTI_FRAME,
-            "objects": [{**_columns(line), **_refinement(frame, line)} for line in frame.lines],
+            "objects": [{**_columns(line), **_refinement(result, line)} for line in result.lines],
         }
         write_json(folder / "json" / f"{frame_id}.json", content)
 
@@ -40,7 +39,6 @@ class KittiExporter(Exporter):
 FORMATS: dict[str, type[Exporter]] = {
     "glb": GlbExporter,
     "ply": PlyExporter,
-    "points": PointsExporter,
     "kitti": KittiExporter,
     "rerun": RerunExporter,
 }
@@ -51,17 +49,14 @@ def export_run(
     inputs: RunInputs,
     folder: Path | str,
     formats: Sequence[str],
-    options: ExportOptions | None = None,
     tell: Callable[[str], object] = lambda _: None,
 ) -> None:
     """Write the finished frames of a run in other formats (docs/outputs.md). The run itself is only read.
 
     Args:
-        inputs: chosen frames of an output folder, shape prior, and the images for colours.
-        folder: folder of `glb`, `ply`, `points`, `kitti` and `recording.rrd`; existing files with the same names are
-            replaced.
+        inputs: chosen frames of an output folder, shape prior, images for colours, and the refiner for iterations.
+        folder: folder of `glb`, `ply`, `kitti` and `recording.rrd`; existing files with the same names are replaced.
         formats: names out of `FORMATS`.
-        options: appearance and details.
         tell: function that is called after each frame.
 
     Raises:
@@ -69,27 +64,22 @@ def export_run(
         InputError: a format is unknown, or needs images which were not given.
         DataFormatError: a file of the run or of the data set is missing, damaged or not that of the run.
     """
-    run, options = inputs.run, ExportOptions() if options is None else options
+    run = inputs.run
     check_folder("out", Path(folder))
     if not run.frame_ids:
         raise InputError("frames", f"finished frames of {run.path}", "none")
     if unknown := [name for name in formats if name not in FORMATS]:
         raise InputError("formats", f"of {', '.join(FORMATS)}", repr(unknown[0]))
-    if options.refiner is not None and not inputs.has_detections:
+    if inputs.refiner is not None and not inputs.has_detections:
         raise InputError("detections", "those of the run, to refine its frames again", "none")
-    exporters = [FORMATS[name](Path(folder), inputs, options) for name in dict.fromkeys(formats)]
     with ExitStack() as stack:
-        for exporter in exporters:
-            stack.callback(exporter.abandon)
+        exporters = [stack.enter_context(FORMATS[name](Path(folder), inputs)) for name in dict.fromkeys(formats)]
         for frame_id in run.frame_ids:
             # All exporters of a frame share what is read and computed.
-            source = FrameSource(inputs, frame_id, options)
+            frame = RunFrame(inputs, frame_id)
             for exporter in exporters:
-                exporter.add(source)
+                exporter.add(frame)
             tell(frame_id)
-        for exporter in exporters:
-            exporter.finish()
-        stack.pop_all()
 
 
 def _columns(line: KittiObject) -> dict[str, Any]:
@@ -107,8 +97,8 @@ def _columns(line: KittiObject) -> dict[str, Any]:
     }
 
 
-def _refinement(frame: FrameResult, line: KittiObject) -> dict[str, Any]:
-    shapes = frame.shapes
+def _refinement(result: FrameResult, line: KittiObject) -> dict[str, Any]:
+    shapes = result.shapes
     car = next((car for car, number in enumerate(shapes.input_lines) if number == line.line_number), None)
     if car is None:
         return {"status": "copied"}

@@ -17,10 +17,10 @@ from directshape_torch.scene.masks import MASK_THRESHOLD
 from directshape_torch.stereo_matching.disparity import rgb8
 from directshape_torch.visualize.drawing import GREEN, GREY, Colour
 from directshape_torch.visualize.drawn_car import cars_of_result
-from directshape_torch.visualize.frame_source import Exporter, FrameSource, frame_numbers
 from directshape_torch.visualize.painted_cars import ground_grid
 from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
 from directshape_torch.visualize.residuals import CarResiduals, photometric_colours, silhouette_colours
+from directshape_torch.visualize.run_frames import Exporter, RunFrame, frame_numbers
 
 if TYPE_CHECKING:
     import trimesh
@@ -54,28 +54,28 @@ class RerunExporter(Exporter):
         self.numbers, self.iteration = frame_numbers(self.inputs.run.frame_ids), 0
         self._stream: _Stream | None = None
 
-    def add(self, source: FrameSource) -> None:
-        loaded, refiner = source.with_images, self.options.refiner
+    def add(self, frame: RunFrame) -> None:
+        loaded, refiner = frame.with_images, self.inputs.refiner
         if self._stream is None:
             # The viewer's views are fitted to the image size of the first frame.
             height, width = loaded.frame.sizes[0].tolist()
             self._stream = _Stream(self.folder / "recording.rrd", (width, height), refiner is not None)
             _log_conventions(self._stream)
-        stream, frame = self._stream, self.numbers[source.frame_id]
-        stream.at(frame, None if refiner is None else self.iteration)
+        stream, number = self._stream, self.numbers[frame.frame_id]
+        stream.at(number, None if refiner is None else self.iteration)
         _log_images(stream, loaded)
-        _log_boxes(stream, source)
+        _log_boxes(stream, frame)
         ground = ground_grid(loaded.frame.ground.normal[0], float(loaded.frame.ground.offset[0]))
         stream.log_mesh("world/ground", ground, GREY)
-        stream.at(frame)
+        stream.at(number)
         _clear_cars(stream)
-        for index, row in enumerate(source.refined):
+        for index, row in enumerate(frame.refined):
             # All frames of a track use one name.
-            track = source.result.shapes.tracks[row]
-            surface, paint = source.painted.mesh(index)
-            stream.log_mesh(f"world/cars/{f'track_{track}' if track else source.after[row].line}", surface, paint.rgb)
+            track = frame.result.shapes.tracks[row]
+            surface, paint = frame.painted.mesh(index)
+            stream.log_mesh(f"world/cars/{f'track_{track}' if track else frame.after[row].line}", surface, paint.rgb)
         if refiner is not None:
-            self._add_iterations(stream, loaded, refiner, frame)
+            self._add_iterations(stream, loaded, refiner, number)
 
     def _add_iterations(self, stream: _Stream, loaded: LoadedFrame, refiner: DirectShapeRefiner, frame: int) -> None:
         device, dtype = refiner.prior.origin.device, refiner.prior.origin.dtype
@@ -92,15 +92,9 @@ class RerunExporter(Exporter):
             _log_residuals(stream, lines[row], residuals)
         self.iteration += len(trace)
 
-    def finish(self) -> None:
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
         if self._stream is not None:
-            self._stream.close()
-            # A finished file must not be removed by `abandon`.
-            self._stream = None
-
-    def abandon(self) -> None:
-        if self._stream is not None:
-            self._stream.close(keep=False)
+            self._stream.close(keep=error is None)
 
 
 def _log_conventions(stream: _Stream) -> None:
@@ -137,13 +131,13 @@ def _log_images(stream: _Stream, loaded: LoadedFrame) -> None:
         stream.log(f"{entity}/masks", rr.SegmentationImage(numbers, opacity=_MASK_OPACITY))
 
 
-def _log_boxes(stream: _Stream, source: FrameSource) -> None:
+def _log_boxes(stream: _Stream, frame: RunFrame) -> None:
     """Log the boxes of the input, of the truth, and of the result, with grey for cars that were not refined."""
-    for name, cars in (("before", source.before or []), ("after", source.after)):
+    for name, cars in (("before", frame.before or []), ("after", frame.after)):
         corners, colours = np.array([car.corners_cam for car in cars]), [car.colour for car in cars]
         labels = [f"{car.line} {car.status or ''}".rstrip() for car in cars]
         stream.log_boxes(f"world/boxes/{name}", corners, colours, labels)
-    truth = np.array(source.truth_corners_cam)
+    truth = np.array(frame.truth_corners_cam)
     stream.log_boxes("world/boxes/truth", truth, [GREEN] * len(truth), ["truth"] * len(truth))
 
 
@@ -247,7 +241,7 @@ class _Stream:
         )
         self.log(entity, boxes)
 
-    def close(self, keep: bool = True) -> None:
+    def close(self, keep: bool) -> None:
         """Write the end and move the file to its path, or remove it."""
         self._stream.flush()
         self._stream.disconnect()

@@ -1,8 +1,9 @@
-"""This module gives the frames of a run with their inputs, as far as these are available and unchanged."""
+"""This module gives the frames of a run with their inputs, as far as these are unchanged, to pages and exporters."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -14,10 +15,11 @@ from torch import Tensor
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.io.run_folder import FrameResult, RunFolder, shapes_path
+from directshape_torch.io.run_folder import FrameResult, RunFolder, result_path, shapes_path
 from directshape_torch.io.run_manifest import hash_file, hash_prior
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refinement.quality import is_front_known
+from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.visualize.drawing import Array
 from directshape_torch.visualize.drawn_car import (
@@ -28,6 +30,7 @@ from directshape_torch.visualize.drawn_car import (
     mean_car,
     true_corners,
 )
+from directshape_torch.visualize.painted_cars import PaintedFrame
 
 if TYPE_CHECKING:
     import trimesh
@@ -48,6 +51,8 @@ class RunInputs:
     # Images, calibrations, masks and detections of the run's frames; None: no pictures and no colours.
     dataset: StereoDataset | None = None
     has_detections: bool = True  # whether the data set has the detections of the run, not substitutes
+    # Refiner that repeats the refinement, for the iterations in a recording; it needs the detections of the run.
+    refiner: DirectShapeRefiner | None = None
     # Inputs that could not be used, with the frames.
     problems: dict[str, set[str]] = field(default_factory=dict)
 
@@ -115,6 +120,24 @@ class RunFrame:
         kept = {role: path for role, path in files.items() if role != "detections" or self.inputs.has_detections}
         return dataset.load(self.frame_id) if self._are_unchanged(kept) else None
 
+    @property
+    def images(self) -> LoadedFrame | None:
+        """The same as `loaded` for an export, which is not made of changed files.
+
+        Raises:
+            DataFormatError: the files of the data set are not those of the run.
+        """
+        if self.loaded is None and self.inputs.dataset is not None:
+            problems = ", ".join(sorted(self.inputs.problems))
+            raise DataFormatError(result_path(self.inputs.run.path, self.frame_id), f"cannot be exported: {problems}")
+        return self.loaded
+
+    @property
+    def with_images(self) -> LoadedFrame:
+        """The same as `images`, for a run with a data set."""
+        assert self.images is not None, "no data set"
+        return self.images
+
     @cached_property
     def t_cam_ref(self) -> Tensor:
         """`x_cam = x_ref + t_cam_ref` (3,), float64, from the states; zero for a frame without cars."""
@@ -143,6 +166,22 @@ class RunFrame:
         fronts = [is_front_known(each) for each in shapes.probabilities_heading.tolist()]
         return cars_after(*of_shapes, corners, fronts, self.before, self.inputs.prior, self.result.mesh_files)
 
+    @cached_property
+    def refined(self) -> list[int]:
+        """Rows of the refined cars, which are the cars of `painted`, in the same order."""
+        return [row for row, car in enumerate(self.after) if car.is_refined]
+
+    @cached_property
+    def painted(self) -> PaintedFrame:
+        """Surfaces with colours.
+
+        Raises:
+            InputError: the shape prior of the run was not given.
+        """
+        if self.inputs.prior is None:
+            raise InputError("--prior", "the shape prior of the run", "nothing")
+        return PaintedFrame([self.after[row] for row in self.refined], self.inputs.prior, self.images)
+
     @property
     def truth_corners_cam(self) -> list[Array]:
         """Corners (8, 3) of the labelled boxes of the refined classes."""
@@ -165,3 +204,32 @@ class RunFrame:
 
     def _note(self, problem: str) -> None:
         self.inputs.problems.setdefault(problem, set()).add(self.frame_id)
+
+
+class Exporter(AbstractContextManager["Exporter"]):
+    """An `Exporter` writes the frames of a run in one format into a folder.
+
+    At its end it writes what needs all frames, or after an error removes what is unfinished.
+    """
+
+    def __init__(self, folder: Path, inputs: RunInputs) -> None:
+        self.folder, self.inputs = folder, inputs
+
+    def add(self, frame: RunFrame) -> None:
+        """Add the next frame."""
+        raise NotImplementedError
+
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        """Most formats have a file for each frame, and nothing to do here."""
+
+
+def frame_numbers(frame_ids: Sequence[str]) -> dict[str, int]:
+    """The numbers in the ids of frames, or 1, 2, .. if the ids are not distinct numbers.
+
+    Examples:
+        >>> frame_numbers(["000107", "007322"])
+        {'000107': 107, '007322': 7322}
+    """
+    if all(one.isdigit() for one in frame_ids) and len({int(one) for one in frame_ids}) == len(frame_ids):
+        return {one: int(one) for one in frame_ids}
+    return {one: number for number, one in enumerate(frame_ids, start=1)}

@@ -1,4 +1,4 @@
-"""This module writes painted cars as glTF scenes of frames and of moving cars, and as PLY surfaces and points."""
+"""This module writes painted cars as glTF scenes of frames and of moving cars, and as PLY surfaces."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.files.mesh_files import T_GLTF_CAM
 from directshape_torch.visualize.drawing import Array
-from directshape_torch.visualize.frame_source import Exporter, FrameSource, frame_numbers
-from directshape_torch.visualize.painted_cars import SEEN, Paint, ground_grid
+from directshape_torch.visualize.painted_cars import Paint, ground_grid
+from directshape_torch.visualize.run_frames import Exporter, RunFrame, frame_numbers
 
 if TYPE_CHECKING:
     import trimesh
@@ -31,18 +31,19 @@ class GlbExporter(Exporter):
         super().__init__(*args)
         self._moving: dict[tuple[str, int], _MovingCar] = {}
 
-    def add(self, source: FrameSource) -> None:
+    def add(self, frame: RunFrame) -> None:
         # Frames come sequence by sequence, and a car is kept until its sequence is over.
-        self._write([key for key in self._moving if not source.frame_id.startswith(_sequence(key[0]))])
-        write_bytes(self.folder / "glb" / f"{source.frame_id}.glb", frame_glb(source))
-        shapes = source.result.shapes
-        for index, row in enumerate(source.refined):
+        self._write([key for key in self._moving if not frame.frame_id.startswith(_sequence(key[0]))])
+        write_bytes(self.folder / "glb" / f"{frame.frame_id}.glb", frame_glb(frame))
+        shapes = frame.result.shapes
+        for index, row in enumerate(frame.refined):
             key = shapes.tracks[row], int(shapes.track_parts[row])
             if key[0] and key[1] >= 0:
-                self._moving.setdefault(key, _MovingCar()).add(source, index)
+                self._moving.setdefault(key, _MovingCar()).add(frame, index)
 
-    def finish(self) -> None:
-        self._write(list(self._moving))
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        if error is None:
+            self._write(list(self._moving))
 
     def _write(self, over: list[tuple[str, int]]) -> None:
         for track, part in over:
@@ -53,29 +54,29 @@ class GlbExporter(Exporter):
                 write_bytes(self.folder / "glb" / f"{name}.glb", car.glb(_sequence(track)))
 
 
-def frame_glb(source: FrameSource) -> bytes:
+def frame_glb(frame: RunFrame) -> bytes:
     """All refined cars of a frame, painted, with a 5 m grid if the frame's ground is known.
 
     Nodes rotate the vertices from the left camera frame, metres, to glTF's axes (y up).
     """
     import trimesh
 
-    scene = trimesh.Scene(metadata={"frame_id": source.frame_id, "vertices": "left camera frame, metres"})
-    for index, car in enumerate(source.painted.cars):
-        mesh, paint = _mesh(source, index)
+    scene = trimesh.Scene(metadata={"frame_id": frame.frame_id, "vertices": "left camera frame, metres"})
+    for index, car in enumerate(frame.painted.cars):
+        mesh, paint = _mesh(frame, index)
         _add(scene, f"car_{car.line}", mesh, paint)
-    if source.images is not None:
-        plane = source.images.frame.ground
+    if frame.images is not None:
+        plane = frame.images.frame.ground
         ground = ground_grid(plane.normal[0], float(plane.offset[0]))
         grey = np.full((len(ground.vertices), 3), _GREY_OF_GROUND, np.uint8)
         _add(scene, "ground", ground, Paint(grey, np.zeros(len(grey), np.uint8)))
     return _glb(scene)
 
 
-def _time_s(source: FrameSource) -> float:
+def _time_s(frame: RunFrame) -> float:
     """The time of the frame, NaN if it is not known."""
-    dataset = source.inputs.dataset
-    time_s = None if dataset is None else dataset.layout.files(source.frame_id).read_motion()[0]
+    dataset = frame.inputs.dataset
+    time_s = None if dataset is None else dataset.layout.files(frame.frame_id).read_motion()[0]
     return np.nan if time_s is None else time_s
 
 
@@ -92,20 +93,20 @@ class _MovingCar:
         self.time_s: list[float] = []
         self._depth_m = np.inf
 
-    def add(self, source: FrameSource, index: int) -> None:
-        T_cam_obj = source.painted.cars[index].T_cam_obj
-        self.T_cam_obj[source.frame_id] = T_cam_obj
-        self.time_s.append(_time_s(source))
+    def add(self, frame: RunFrame, index: int) -> None:
+        T_cam_obj = frame.painted.cars[index].T_cam_obj
+        self.T_cam_obj[frame.frame_id] = T_cam_obj
+        self.time_s.append(_time_s(frame))
         if T_cam_obj[2, 3] < self._depth_m:
-            self._depth_m, self._nearest = float(T_cam_obj[2, 3]), (source, index)
+            self._depth_m, self._nearest = float(T_cam_obj[2, 3]), (frame, index)
 
     def glb(self, sequence: str) -> bytes:
         """A scene with a car at the origin of a node that moves in the left camera frame, below a node with y up."""
         import trimesh
 
-        source, index = self._nearest
-        mesh, paint = _mesh(source, index)
-        mesh.apply_transform(np.linalg.inv(self.T_cam_obj[source.frame_id]))
+        frame, index = self._nearest
+        mesh, paint = _mesh(frame, index)
+        mesh.apply_transform(np.linalg.inv(self.T_cam_obj[frame.frame_id]))
         scene = trimesh.Scene(metadata={"frame_ids": list(self.T_cam_obj), "vertices": "object frame, metres"})
         place: Callable[..., None] = scene.graph.update
         place(frame_to=_CAMERA, matrix=T_GLTF_CAM)
@@ -149,14 +150,14 @@ def _accessor(buffers: MutableMapping[str, bytes], tree: dict[str, Any], name: s
     return len(tree["accessors"]) - 1
 
 
-def _mesh(source: FrameSource, index: int) -> tuple[trimesh.Trimesh, Paint]:
+def _mesh(frame: RunFrame, index: int) -> tuple[trimesh.Trimesh, Paint]:
     """Surface and colours of a refined car; what is known of the car becomes the `extras` of the mesh."""
-    (mesh, paint), row, shapes = source.painted.mesh(index, finer=True), source.refined[index], source.result.shapes
+    (mesh, paint), row, shapes = frame.painted.mesh(index, finer=True), frame.refined[index], frame.result.shapes
     mesh.metadata |= {
-        "frame_id": source.frame_id,
-        "line": source.after[row].line,
-        "type": source.result.cars[row].type,
-        "status": source.after[row].status,
+        "frame_id": frame.frame_id,
+        "line": frame.after[row].line,
+        "type": frame.result.cars[row].type,
+        "status": frame.after[row].status,
         "dimensions_hwl_m": shapes.boxes_hwl[row].tolist(),
         "probability_better": float(shapes.probabilities_better[row]),
     }
@@ -205,37 +206,18 @@ def _finish(tree: dict[str, Any]) -> None:
 class PlyExporter(Exporter):
     """A `PlyExporter` writes `ply/NNNNNN_LINE.ply`: surfaces with normals, sRGB and `color_source` (see `Paint`)."""
 
-    def add(self, source: FrameSource) -> None:
-        for index, car in enumerate(source.painted.cars):
-            path = self.folder / "ply" / f"{source.frame_id}_{car.line}.ply"
-            write_bytes(path, _ply(*source.painted.mesh(index)))
+    def add(self, frame: RunFrame) -> None:
+        for index, car in enumerate(frame.painted.cars):
+            path = self.folder / "ply" / f"{frame.frame_id}_{car.line}.ply"
+            write_bytes(path, _ply(*frame.painted.mesh(index)))
 
 
-class PointsExporter(Exporter):
-    """A `PointsExporter` writes `points/NNNNNN_LINE.ply` of each car, and `.._stereo.ply` if stereo has points."""
-
-    def add(self, source: FrameSource) -> None:
-        import trimesh
-
-        painted, measured = source.painted, source.painted.stereo_points()
-        for index, car in enumerate(painted.cars):
-            stem = self.folder / "points" / f"{source.frame_id}_{car.line}"
-            points_cam, normals_cam, paint = painted.samples(index, self.options.points_per_car)
-            spread = trimesh.Trimesh(points_cam, vertex_normals=normals_cam, process=False)
-            write_bytes(f"{stem}.ply", _ply(spread, paint))
-            if car.line in measured:
-                points_cam, rgb = measured[car.line]
-                paint = Paint(rgb, np.full(len(rgb), SEEN, np.uint8))
-                write_bytes(f"{stem}_stereo.ply", _ply(trimesh.Trimesh(points_cam, process=False), paint, False))
-
-
-def _ply(mesh: trimesh.Trimesh, paint: Paint, with_normals: bool = True) -> bytes:
-    """A surface or, without triangles, points, as PLY."""
+def _ply(mesh: trimesh.Trimesh, paint: Paint) -> bytes:
     from trimesh.exchange.ply import export_ply
     from trimesh.visual import ColorVisuals
 
     opaque = np.full((len(paint.rgb), 1), 255, dtype=np.uint8)
     mesh.visual = ColorVisuals(mesh, vertex_colors=np.concatenate([paint.rgb, opaque], axis=1))
     mesh.vertex_attributes["color_source"] = paint.source
-    content: bytes = export_ply(mesh, vertex_normal=with_normals)
+    content: bytes = export_ply(mesh, vertex_normal=True)
     return content

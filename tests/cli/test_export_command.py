@@ -45,20 +45,16 @@ def test_the_detections_need_not_be_named(finished: FinishedRun, tmp_path: Path)
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 
-def test_masks_and_grey_change_the_colours(finished: FinishedRun, tmp_path: Path) -> None:
+def test_masks_change_the_colours(finished: FinishedRun, tmp_path: Path) -> None:
     data = ("--format", "ply", "--data", finished.root)
     assert main(command(finished, tmp_path / "plain", *data)) == 0
     assert main(command(finished, tmp_path / "masks", *data, "--masks", finished.root / "masks")) == 0
-    assert main(command(finished, tmp_path / "grey", *data, "--unseen", "grey")) == 0
-    found = [contents(tmp_path / name)["ply/000000_1.ply"] for name in ("plain", "masks", "grey")]
-    assert len(set(found)) == 3
+    found = [contents(tmp_path / name)["ply/000000_1.ply"] for name in ("plain", "masks")]
+    assert found[0] != found[1]
 
 
-@pytest.mark.parametrize(
-    ("words", "purpose"), [(("points",), "stereo points"), (("rerun", "--iterations"), "--iterations")]
-)
-def test_what_depends_on_the_runs_field_asks_for_it(
-    finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], purpose: str
+def test_iterations_ask_for_the_runs_field(
+    finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = Path(shutil.copytree(finished.out, tmp_path / "out"))
     summary = json.loads((out / "summary.json").read_text())
@@ -66,9 +62,9 @@ def test_what_depends_on_the_runs_field_asks_for_it(
     (out / "summary.json").write_text(json.dumps(summary))
     run = replace(finished, out=out)
     inputs = ("--data", run.root, "--detections", run.root / "detections", "--masks", run.root / "masks")
-    assert main(command(run, tmp_path / "export", "--format", *words, *inputs)) == 2
+    assert main(command(run, tmp_path / "export", "--format", "rerun", "--iterations", *inputs)) == 2
     said = capsys.readouterr().err
-    assert f"--rig: expected the file that the run was made with, for {purpose}, got nothing" in said
+    assert "--rig: expected the file that the run was made with, for --iterations, got nothing" in said
 
 
 def test_another_rigs_field_is_refused(
@@ -83,7 +79,7 @@ def test_another_rigs_field_is_refused(
     rig = {"K_left": camera.K_left[0], "K_right": camera.K_right[0], "T_right_cam": camera.T_right_cam[0]}
     hull = torch.tensor([[0.0, 0.0], [159.0, 0.0], [159.0, 119.0]])
     save_field(DisparityField(torch.zeros(10), hull_uv=hull, size_wh=(160, 120), **rig), tmp_path / "bias.json")
-    words = ("--format", "points", "--data", finished.root, "--rig", tmp_path / "bias.json")
+    words = ("--format", "glb", "--data", finished.root, "--rig", tmp_path / "bias.json")
     assert main(command(finished, tmp_path / "out", *words)) == 2
     assert "--rig: expected the disparity fields that the run was made with, got others in" in capsys.readouterr().err
 

@@ -26,8 +26,8 @@ from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.visualize.export_run import export_run
-from directshape_torch.visualize.frame_source import ExportOptions, FrameSource
 from directshape_torch.visualize.painted_cars import SEEN
+from directshape_torch.visualize.run_frames import RunFrame
 
 pytest.importorskip("rerun", reason="the extra `viewer` is not installed")
 
@@ -77,7 +77,7 @@ def refiner_of(run: FinishedRun) -> DirectShapeRefiner:
 @pytest.fixture(scope="module")
 def path(finished: FinishedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("rerun") / "sub" / "recording.rrd"
-    export_run(finished.inputs(), path.parent, ["rerun"], ExportOptions(refiner=refiner_of(finished)))
+    export_run(replace(finished.inputs(), refiner=refiner_of(finished)), path.parent, ["rerun"])
     assert [file.name for file in path.parent.iterdir()] == ["recording.rrd"]
     return path
 
@@ -167,7 +167,7 @@ def test_boxes_are_those_of_the_files(finished: FinishedRun, recording: Recordin
 def test_frames_show_the_refined_surfaces_with_the_colours_of_the_image(
     finished: FinishedRun, recording: Recording
 ) -> None:
-    painted = FrameSource(finished.inputs(), "000001", ExportOptions()).painted
+    painted = RunFrame(finished.inputs(), "000001").painted
     for index, car in enumerate(painted.cars):
         mesh, paint = painted.mesh(index)
         entity = f"/world/cars/{car.line}"
@@ -269,7 +269,7 @@ def test_an_end_that_fails_leaves_nothing_half_written(
     formats = ["rerun", "glb"] if recording_first else ["glb", "rerun"]
     with pytest.raises(OSError, match=r"track_000007\.glb"):
         export_run(finished.inputs(run), out, formats)
-    assert {path.name for path in out.iterdir()} == ({"glb", "recording.rrd"} if recording_first else {"glb"})
+    assert {path.name for path in out.iterdir()} == ({"glb"} if recording_first else {"glb", "recording.rrd"})
 
 
 def test_without_rerun_the_error_says_what_to_install(

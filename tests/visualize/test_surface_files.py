@@ -12,9 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers.disparity_maps import write_disparity
 from helpers.finished_run import FinishedRun
-from helpers.quick_runs import dataset
 from numpy.typing import NDArray
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
@@ -23,7 +21,6 @@ from directshape_torch.io.frame_layout import FrameFiles
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.visualize.export_run import export_run
-from directshape_torch.visualize.frame_source import ExportOptions
 from directshape_torch.visualize.painted_cars import MIRRORED, NEUTRAL, NEUTRAL_RGB, SEEN
 
 Floats = NDArray[np.float64]
@@ -33,7 +30,7 @@ LINES = (1, 3)
 @pytest.fixture(scope="module")
 def exported(finished: FinishedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("surfaces")
-    export_run(finished.inputs(), folder, ["glb", "ply", "points"], ExportOptions(points_per_car=3000))
+    export_run(finished.inputs(), folder, ["glb", "ply"])
     return folder
 
 
@@ -241,54 +238,21 @@ def test_ply_has_the_surface_and_the_colours_of_glb(exported: Path) -> None:
     np.testing.assert_array_equal(faces, file.attribute("car_3", "indices").reshape(-1, 3))
 
 
-def test_points_lie_evenly_on_the_surface(finished: FinishedRun, exported: Path) -> None:
-    path = exported / "points" / "000000_1.ply"
-    points = ply(path)
-    assert len(points) == 3000
-    assert np.abs(distances(finished, "000000", 0, points)).max() < 0.02
-    outside = distances(finished, "000000", 0, points + 0.05 * ply(path, NORMAL))
-    assert (outside > distances(finished, "000000", 0, points)).mean() > 0.999
-    # The two halves of a symmetric surface have equal areas: 1500 points each, give or take four standard deviations.
-    T = finished.state("000000")["T_cam_obj"][0].astype(np.float64)
-    left = ((points - T[:3, 3]) @ T[:3, 2] > 0).sum()
-    assert abs(left - 1500) < 110
-    seen = ply(path, ["color_source"])[:, 0] == SEEN
-    np.testing.assert_allclose(ply(path, RGB)[seen], image_at(finished, "000000", points[seen]), atol=1.01)
-    assert 0.1 < seen.mean() < 0.5
-
-
-def test_stereo_points_are_those_of_the_disparity_map(finished: FinishedRun, tmp_path: Path) -> None:
-    """A map of constant disparity puts every point of a mask at the depth f b / d."""
-    write_disparity(tmp_path / "maps" / "000000.png", np.full((120, 160), 10.0))
-    maps = dataset(finished.root, frames=["000000"], disparity_dir=tmp_path / "maps")
-    export_run(replace(finished.inputs(RunFolder(finished.out, [0])), dataset=maps), tmp_path, ["points"])
-    path = tmp_path / "points" / "000000_1_stereo.ply"
-    points = ply(path)
-    # z_right = z + 0.004, so that the disparity is f 0.53 / z to first order.
-    np.testing.assert_allclose(points[:, 2], 150 * 0.53 / 10, rtol=5e-3)
-    mask = maps.load("000000").detections.mask_left[0].numpy() > 0.5
-    u, v = (np.rint(points[:, k] / points[:, 2] * 150 + c).astype(int) for k, c in ((0, 77), (1, 50)))
-    assert mask[v, u].all()
-    assert len(points) > 0.5 * mask.sum()
-    bgr = cv2.imread(str(finished.root / "training/image_2/000000.png"))
-    np.testing.assert_allclose(ply(path, RGB), bgr[v, u][:, ::-1], atol=1)
-
-
 def test_without_images_everything_is_grey(finished: FinishedRun, tmp_path: Path) -> None:
-    export_run(finished.inputs(with_images=False), tmp_path, ["glb", "ply", "points"])
+    export_run(finished.inputs(with_images=False), tmp_path, ["glb", "ply"])
     file = glb(tmp_path / "glb" / "000000.glb")
     assert set(file.nodes) == {"car_1", "car_3"}
     assert (file.attribute("car_1", "_COLOR_SOURCE") == NEUTRAL).all()
     assert len(np.unique(file.attribute("car_1", "COLOR_0"), axis=0)) == 1
-    assert sorted(path.name for path in (tmp_path / "points").iterdir()) == [
+    assert sorted(path.name for path in (tmp_path / "ply").iterdir()) == [
         f"{frame}_{line}.ply" for frame in ("000000", "000001") for line in LINES
     ]
 
 
 def test_equal_runs_give_equal_bytes(finished: FinishedRun, exported: Path, tmp_path: Path) -> None:
-    export_run(finished.inputs(), tmp_path, ["glb", "ply", "points"], ExportOptions(points_per_car=3000))
+    export_run(finished.inputs(), tmp_path, ["glb", "ply"])
     names = sorted(path.relative_to(exported) for path in exported.rglob("*.*"))
-    assert len(names) > 10
+    assert len(names) == 6
     for name in names:
         assert (exported / name).read_bytes() == (tmp_path / name).read_bytes(), name
 
@@ -299,8 +263,8 @@ def test_a_frame_without_refined_cars_has_no_surfaces(finished: FinishedRun, tmp
     path = out / "shapes" / "000000.npz"
     write_shapes(path, replace(read_shapes(path), statuses=("no_mask", "singular")))
     run = RunFolder(out, [0])
-    export_run(finished.inputs(run), tmp_path / "images", ["glb", "ply", "points"])
+    export_run(finished.inputs(run), tmp_path / "images", ["glb", "ply"])
     assert set(glb(tmp_path / "images" / "glb" / "000000.glb").nodes) == {"ground"}
-    export_run(finished.inputs(run, with_images=False), tmp_path / "plain", ["glb", "ply", "points"])
+    export_run(finished.inputs(run, with_images=False), tmp_path / "plain", ["glb", "ply"])
     assert glb(tmp_path / "plain" / "glb" / "000000.glb").nodes == {}
     assert not list(tmp_path.rglob("*.ply"))
