@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.batch.options import MeshFormat, RefineOptions
+from directshape_torch.batch.options import RefineOptions
 from directshape_torch.errors import DataFormatError
-from directshape_torch.files.atomic_files import write_bytes, write_png, write_text
-from directshape_torch.files.mesh_files import T_GLTF_CAM
+from directshape_torch.files.atomic_files import write_png, write_text
 from directshape_torch.geometry.box3d import alpha_from_kitti
-from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.result_files import (
     RefinedBox,
     ShapeArrays,
@@ -32,7 +30,6 @@ from directshape_torch.io.run_folder import (
     FrameRecord,
     failure_path,
     frame_entry,
-    mesh_path,
     overlay_path,
     read_record,
     result_path,
@@ -42,9 +39,6 @@ from directshape_torch.io.run_manifest import hash_bytes
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refinement.result import KittiBoxes, RefinementResult
 from directshape_torch.status import Status
-
-if TYPE_CHECKING:
-    import trimesh
 
 
 def write_frame_outputs(
@@ -64,8 +58,6 @@ def write_frame_outputs(
     path = shapes_path(out_dir, loaded.frame_id)
     earlier = _earlier_record(path, run, inputs)
     files = [result_path(out_dir, loaded.frame_id)]
-    if options.meshes is not None:
-        files += write_meshes(out_dir, loaded.frame_id, loaded.detected_objects, result, options.meshes)
     if options.draw is not None:
         files.append(overlay_path(out_dir, loaded.frame_id))
         write_png(files[-1], options.draw(loaded, result))
@@ -90,38 +82,11 @@ def _earlier_record(path: Path, run: str, inputs: Mapping[str, str]) -> FrameRec
     return None
 
 
-def write_meshes(
-    out_dir: Path | str, frame_id: str, lines: Sequence[KittiObject], result: RefinementResult, mesh_format: MeshFormat
-) -> list[Path]:
-    """Write the surface of each refined car in the left camera frame, metres, and return the files.
-
-    GLB files have the vertices of PLY files below a node that rotates them to glTF's axes (y up).
-    """
-    paths, refined = [], result.refined.tolist()
-    for car, line in enumerate(lines):
-        if refined[car]:
-            paths.append(mesh_path(out_dir, frame_id, line.line_number, mesh_format))
-            write_bytes(paths[-1], _mesh_bytes(result.mesh(car), mesh_format))
-    return paths
-
-
 def refined_boxes(boxes: KittiBoxes, refined: Tensor, rows: Sequence[int]) -> dict[int, RefinedBox]:
     """The new box of each refined car, by its input row; rows without a box keep their line."""
     hwl, location, yaw = (each.double().cpu() for each in (boxes.dimensions_hwl, boxes.location_ref, boxes.rotation_y))
     columns = torch.cat([alpha_from_kitti(location, yaw)[:, None], hwl, location, yaw[:, None]], dim=1).tolist()
     return {row: columns[car] for car, row in enumerate(rows) if refined[car]}
-
-
-def _mesh_bytes(mesh: trimesh.Trimesh, mesh_format: MeshFormat) -> bytes:
-    import trimesh
-    from trimesh.exchange import gltf, ply
-
-    to_glb: Callable[..., bytes] = gltf.export_glb
-    if mesh_format == "ply":
-        return cast(bytes, ply.export_ply(mesh))
-    scene = trimesh.Scene()
-    scene.add_geometry(mesh, node_name="car", geom_name="car", transform=T_GLTF_CAM)
-    return to_glb(scene, include_normals=True)
 
 
 def _shape_arrays(loaded: LoadedFrame, result: RefinementResult, boxes: KittiBoxes, prior_sha256: str) -> ShapeArrays:

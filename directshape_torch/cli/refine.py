@@ -12,11 +12,10 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
 
 from directshape_torch.batch.group_refinement import limited_threads
 from directshape_torch.batch.learn_detector import learn_detector
-from directshape_torch.batch.options import MeshFormat, RefineOptions
+from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.ray_engine import check_cluster
 from directshape_torch.batch.refine_dataset import check_out_dir, refine_dataset
 from directshape_torch.batch.run_summary import format_summary
@@ -70,7 +69,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def _add_outputs(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets data, shapes, summary.json ..")
-    group.add_argument("--meshes", choices=get_args(MeshFormat), help="write the surface of each refined car")
     group.add_argument("--overlays", action="store_true", help="write a picture of each frame, before and after")
     group.add_argument(
         "--fresh", action="store_true", help="remove the results that runs have left in DIR, start again"
@@ -105,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
     default_frames = _TRACK_FRAMES if args.tracks else 1
     batch_frames = default_frames if args.batch_frames is None else args.batch_frames
     draw = overlay_of_frame if args.overlays else None
-    options = RefineOptions(args.meshes, draw, batch_frames, args.workers, args.threads, args.ray)
+    options = RefineOptions(draw, batch_frames, args.workers, args.threads, args.ray)
     extra = [] if args.lidar is None else [LidarPoints()]
     exact = ["rig.disparity_sigma_px=0"] if args.rig == "none" else []
     settings = [*exact, *args.set]

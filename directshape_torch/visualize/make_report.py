@@ -46,7 +46,7 @@ def make_report(
 
     Args:
         inputs: chosen frames of the output folder of `directshape refine`, and the inputs of the run. Without the shape
-            prior the page has only boxes and saved meshes.
+            prior the page has only boxes.
         page: the HTML file to write.
         most_frames: maximum number of frames with pictures and 3D views; the table has all cars in any case.
         tell: function that is called after each frame with details.
@@ -97,7 +97,7 @@ def _notes(inputs: RunInputs, num_detailed: int) -> list[str]:
     if dataset is not None and dataset.masks is None:
         notes.append("no residual maps: the masks were not given (--masks)")
     if inputs.prior is None:
-        notes.append("no residual maps, and no meshes but saved ones: the prior was not given (--prior)")
+        notes.append("no residual maps and no shapes: the prior was not given (--prior)")
     if run.manifest.sha256["stereo_bias"] is not None and dataset is not None and not dataset.disparity_fields:
         notes.append("photometric residuals without the run's disparity field, so biased (--rig)")
     if num_detailed < len(run.frame_ids):

@@ -47,7 +47,7 @@ class RunInputs:
     """
 
     run: RunFolder
-    prior: ShapePrior | None = None  # shape prior of the run; None: saved meshes or no shapes
+    prior: ShapePrior | None = None  # shape prior of the run; None: no shapes
     # Images, calibrations, masks and detections of the run's frames; None: no pictures and no colours.
     dataset: StereoDataset | None = None
     has_detections: bool = True  # whether the data set has the detections of the run, not substitutes
@@ -164,7 +164,7 @@ class RunFrame:
         corners = corners_cam(location_ref, rotation_y, hwl, self.t_cam_ref)
         of_shapes = (shapes.input_lines.tolist(), shapes.statuses, shapes.T_cam_obj, shapes.codes)
         fronts = [is_front_known(each) for each in shapes.probabilities_heading.tolist()]
-        return cars_after(*of_shapes, corners, fronts, self.before, self.inputs.prior, self.result.mesh_files)
+        return cars_after(*of_shapes, corners, fronts, self.before, self.inputs.prior)
 
     @cached_property
     def refined(self) -> list[int]:
