@@ -23,7 +23,7 @@ from directshape_torch.io.run_manifest import hash_fields, hash_prior
 from directshape_torch.io.stereo_dataset import GroundSource, LayoutName, StereoDataset, open_dataset
 from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.rig.rig_file import RIG_FILE, load_fields
+from directshape_torch.rig.rig_file import RIG_FILE, known_rigs, load_rigs
 from directshape_torch.shape.load_prior import BUNDLED_PRIORS, load_prior
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.visualize.run_frames import RunInputs
@@ -153,7 +153,7 @@ def dataset_of(args: argparse.Namespace) -> StereoDataset:
         classes=args.classes,
         ground=args.ground,
         camera_height_m=args.camera_height,
-        disparity_field=() if args.rig in ("auto", "none") else load_fields(args.rig),
+        disparity_field=[rig.field for rig in known_rigs(args.rig)],
         disparity_dir=getattr(args, "disparity", None),
         lidar_dir=getattr(args, "lidar", None),
         tracks=getattr(args, "tracks", False),
@@ -272,7 +272,7 @@ def _fields_of_run(rig: str, run: RunFolder) -> tuple[DisparityField, ...]:
     if rig == "none" and (wanted is None or not own.is_file()):
         return ()
     path = own if rig == "none" else Path(rig)
-    fields = load_fields(path)
+    fields = tuple(estimate.field for estimate in load_rigs(path))
     if hash_fields(fields) != wanted:
         raise InputError("--rig", "the disparity fields that the run was made with", f"others in {path}")
     return fields

@@ -11,6 +11,8 @@ import pytest
 from helpers.finished_run import FinishedRun
 
 from directshape_torch.cli.main import main
+from directshape_torch.rig.estimate import RigEstimate
+from directshape_torch.rig.rig_file import save_rigs
 
 
 def command(run: FinishedRun, out: Path, *words: str | Path) -> list[str]:
@@ -70,15 +72,8 @@ def test_iterations_ask_for_the_runs_field(
 def test_another_rigs_field_is_refused(
     finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import torch
-
-    from directshape_torch.geometry.disparity_field import DisparityField
-    from directshape_torch.rig.rig_file import save_field
-
-    camera = finished.inputs().dataset.load("000000").frame.camera
-    rig = {"K_left": camera.K_left[0], "K_right": camera.K_right[0], "T_right_cam": camera.T_right_cam[0]}
-    hull = torch.tensor([[0.0, 0.0], [159.0, 0.0], [159.0, 119.0]])
-    save_field(DisparityField(torch.zeros(10), hull_uv=hull, size_wh=(160, 120), **rig), tmp_path / "bias.json")
+    frames = finished.inputs().dataset.load("000000").frame  # type: ignore[union-attr]
+    save_rigs(tmp_path / "bias.json", [RigEstimate.of_frames(frames)])
     words = ("--format", "glb", "--data", finished.root, "--rig", tmp_path / "bias.json")
     assert main(command(finished, tmp_path / "out", *words)) == 2
     assert "--rig: expected the disparity fields that the run was made with, got others in" in capsys.readouterr().err

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 import trimesh
 from helpers.disparity_maps import write_disparity
 from helpers.kitti_folder import FRAMES
@@ -26,7 +25,6 @@ from directshape_torch.batch.run_summary import RunTimings, digit_warnings
 from directshape_torch.cli.fit_shape import read_boxes
 from directshape_torch.errors import MeshError
 from directshape_torch.files.mesh_files import MESH_SUFFIXES, read_mesh
-from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.image_files import read_disparity
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_calibration import read_calibration
@@ -39,7 +37,7 @@ from directshape_torch.io.run_status import format_status, read_status
 from directshape_torch.io.stereo_dataset import LayoutName, open_dataset
 from directshape_torch.io.velodyne import read_points, read_scan
 from directshape_torch.rig.estimate import RigEstimate
-from directshape_torch.rig.rig_file import load_field, load_rigs, save_field, save_rigs
+from directshape_torch.rig.rig_file import load_rigs, save_rigs
 from directshape_torch.shape.load_prior import BUNDLED_PRIORS, load_prior
 from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
 from directshape_torch.visualize.make_report import make_report
@@ -85,8 +83,6 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
     (folder / "split.txt").write_text("".join(f"{name}\n" for name in FRAMES))
     write_shapes(folder / "shapes.npz", shape_arrays(2))
     write_disparity(folder / "disparity.png", np.full((12, 16), 7.5))
-    field = DisparityField.constant(-0.4, (160, 120), torch.eye(3), torch.eye(3), torch.eye(4))
-    save_field(field, folder / "field.json")
     street = cached_street()[1]
     rig = RigEstimate.of_frames(street.frames)
     rig.update(street.frames, street.detections)
@@ -116,7 +112,6 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
         "tracking": (folder / "tracking.txt", read_tracking_objects),
         "shapes": (folder / "shapes.npz", read_shapes),
         "disparity": (folder / "disparity.png", read_disparity),
-        "field": (folder / "field.json", load_field),
         "rigs": (folder / "rigs.json", lambda path: [(each.field, str(each)) for each in load_rigs(path)]),
         "split": (folder / "split.txt", lambda path: dataset(root, split=path).frame_ids),
         "scan": (folder / "scan.bin", scan),
