@@ -40,8 +40,6 @@ CASES = [
     (f"{INSPECT} --demo --car 9", "car of frame 000000: 1, 2, 3, 4, 5, 6, got 9"),
     (f"{INSPECT} --demo --data x", "bundled frame alone"),
     (f"{INSPECT} --data {DEMO_FOLDER}", "give --frame ID"),
-    (f"{INSPECT} --demo --tracks", "expected frames of a sequence, got --demo, one frame; give --data with --frames"),
-    (f"{INSPECT} --data x --tracks --car 1", "all cars of several frames, got --car 1 too"),
     (f"{INSPECT} --demo --prior nowhere.npz", "nowhere.npz"),
     (f"{INSPECT} --demo --car 2 --set sampling.min_usable_pixels=100000", "too_few_pixels"),
     ("build-prior --meshes nowhere --out {out}/car.safetensors", "--meshes: expected a folder"),
