@@ -54,7 +54,7 @@ def export_run(
     """Write the finished frames of a run in other formats (docs/outputs.md). The run itself is only read.
 
     Args:
-        inputs: chosen frames of an output folder, shape prior, images for colours, and the refiner for iterations.
+        inputs: chosen frames of an output folder, shape prior, and the images for colours.
         folder: folder of `glb`, `ply`, `kitti` and `recording.rrd`; existing files with the same names are replaced.
         formats: names out of `FORMATS`.
         tell: function that is called after each frame.
@@ -70,8 +70,6 @@ def export_run(
         raise InputError("frames", f"finished frames of {run.path}", "none")
     if unknown := [name for name in formats if name not in FORMATS]:
         raise InputError("formats", f"of {', '.join(FORMATS)}", repr(unknown[0]))
-    if inputs.refiner is not None and not inputs.has_detections:
-        raise InputError("detections", "those of the run, to refine its frames again", "none")
     with ExitStack() as stack:
         exporters = [stack.enter_context(FORMATS[name](Path(folder), inputs)) for name in dict.fromkeys(formats)]
         for frame_id in run.frame_ids:

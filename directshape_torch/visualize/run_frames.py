@@ -19,7 +19,6 @@ from directshape_torch.io.run_folder import FrameResult, RunFolder, result_path,
 from directshape_torch.io.run_manifest import hash_file, hash_prior
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refinement.quality import is_front_known
-from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.visualize.drawing import Array
 from directshape_torch.visualize.drawn_car import (
@@ -51,8 +50,6 @@ class RunInputs:
     # Images, calibrations, masks and detections of the run's frames; None: no pictures and no colours.
     dataset: StereoDataset | None = None
     has_detections: bool = True  # whether the data set has the detections of the run, not substitutes
-    # Refiner that repeats the refinement, for the iterations in a recording; it needs the detections of the run.
-    refiner: DirectShapeRefiner | None = None
     # Inputs that could not be used, with the frames.
     problems: dict[str, set[str]] = field(default_factory=dict)
 

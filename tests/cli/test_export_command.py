@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -55,20 +52,6 @@ def test_masks_change_the_colours(finished: FinishedRun, tmp_path: Path) -> None
     assert found[0] != found[1]
 
 
-def test_iterations_ask_for_the_runs_field(
-    finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = Path(shutil.copytree(finished.out, tmp_path / "out"))
-    summary = json.loads((out / "summary.json").read_text())
-    summary["sha256"]["stereo_bias"] = "0" * 64
-    (out / "summary.json").write_text(json.dumps(summary))
-    run = replace(finished, out=out)
-    inputs = ("--data", run.root, "--detections", run.root / "detections", "--masks", run.root / "masks")
-    assert main(command(run, tmp_path / "export", "--format", "rerun", "--iterations", *inputs)) == 2
-    said = capsys.readouterr().err
-    assert "--rig: expected the file that the run was made with, for --iterations, got nothing" in said
-
-
 def test_another_rigs_field_is_refused(
     finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -77,18 +60,3 @@ def test_another_rigs_field_is_refused(
     words = ("--format", "glb", "--data", finished.root, "--rig", tmp_path / "bias.json")
     assert main(command(finished, tmp_path / "out", *words)) == 2
     assert "--rig: expected the disparity fields that the run was made with, got others in" in capsys.readouterr().err
-
-
-def test_a_recording_has_the_iterations_and_needs_the_inputs_of_the_run(
-    finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("rerun", reason="the extra `viewer` is not installed")
-    from rerun.chunk import RrdReader
-
-    root = finished.root
-    words = command(finished, tmp_path, "--format", "rerun", "--iterations", "--frames", "0", "--data", root)
-    assert main(words) == 2
-    assert "--detections: expected that of the run, for --iterations, got nothing" in capsys.readouterr().err
-    assert main([*words, "--detections", str(root / "detections"), "--masks", str(root / "masks")]) == 0
-    found = {chunk.entity_path for chunk in RrdReader(str(tmp_path / "recording.rrd")).stream()}
-    assert {"/world/cars/1", "/world/cars/3", "/terms/000000/1/photometric", "/world/boxes/before"} <= found

@@ -22,7 +22,6 @@ CASES = [
     (f"{EXPORT} --format rerun", "--data: expected the data set of the run, for the pictures of a recording"),
     (f"{EXPORT} --format ply --masks x", "--data: expected the data set of the run, because of --masks"),
     (f"{EXPORT} --format ply --masks-left x", "because of --masks-left"),
-    (f"{EXPORT} --format ply --iterations", "--iterations: expected --format rerun, which alone records them, got ply"),
     (f"{EXPORT} --format ply --frames 7", "frames: expected finished frames of"),
     (f"{EXPORT} --format ply --prior pca", "--prior: expected the prior of the run"),
     ("export {root} --format kitti --out {out}", "summary.json: is missing"),
