@@ -57,7 +57,7 @@ CASES = [
             f"{INSPECT} --demo",
             f"{INSPECT}/figures --demo",
             f"{EXPORT} --format ply",
-            "fit-shape --points x --boxes x --out {out}",
+            "fit-shape --data x --lidar x --boxes x --out {out}",
             "calibrate-rig --data {root} --out {out}/rig.json",
             PRIOR,
             f"report {{run}} --html {FILE}/page.html",

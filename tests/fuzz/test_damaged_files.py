@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from directshape_torch.errors import DirectShapeError, ResumeError
 
 FORMATS = (
-    "tracking", "shapes", "disparity", "rigs", "split", "points",
-    "scan", "network", "prior", "boxes", "times", "poses", "mesh obj", "mesh ply", "mesh glb", "mesh off", "mesh stl",
+    "tracking", "shapes", "disparity", "rigs", "split",
+    "scan", "network", "prior", "times", "poses", "mesh obj", "mesh ply", "mesh glb", "mesh off", "mesh stl",
     "settings", "coco", "instances", "image", "calibration", "plane", "labels", "detections", "masks", "rig",
     "frame", "raw calibration", "sequence calibration", "summary", "results", "report", "status", "timings",
     "results of a frame",
