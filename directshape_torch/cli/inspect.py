@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.cli.demo import demo_dataset
-from directshape_torch.cli.options import add_data_options, add_refiner_options, dataset_of, frame_id_of, make_refiner
+from directshape_torch.cli.options import add_data_options, add_refiner_options, dataset_of, make_refiner
 from directshape_torch.cli.progress import Bar
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.matching import match_to_labels
@@ -46,7 +46,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of frames, car and settings."""
     data = parser.add_argument_group("input")
     data.add_argument("--demo", action="store_true", help="the bundled frame, without data")
-    data.add_argument("--frame", metavar="ID", type=frame_id_of, help="the frame; --frames for several")
     data.add_argument("--car", metavar="N", type=int, help="number of its line in the detection file; default: all")
     add_data_options(data, required=False)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets a folder of figures a car")
@@ -71,13 +70,11 @@ def _dataset(args: argparse.Namespace) -> StereoDataset:
     if args.demo:
         if args.data is not None:
             raise InputError("--demo", "the bundled frame alone", f"--data {args.data} too", "leave one of them out")
-        return demo_dataset(None if args.frame is None else [args.frame])
+        return demo_dataset(args.frames)
     if args.data is None:
-        raise InputError("inspect", "something to inspect", "no frame", "give --data with --frame, or --demo")
-    if args.frame is not None:
-        args.frames = [args.frame]
+        raise InputError("inspect", "something to inspect", "no frame", "give --data with --frames, or --demo")
     if args.frames is None:
-        raise InputError("--frame", "the frame to inspect", "none", "give --frame ID, or several with --frames")
+        raise InputError("--frames", "the frames to inspect", "none", "give --frames ID, one or several")
     return dataset_of(args)
 
 

@@ -227,14 +227,14 @@ def dataset_of_run(args: argparse.Namespace, run: RunFolder) -> StereoDataset | 
         if given:
             raise InputError("--data", f"the data set of the run, because of {', '.join(given)}", "nothing")
         return None
+    masks = mask_source(args)
+    of_masks = run.manifest.config.get("boxes") == "masks" and masks is not None
     return open_dataset(
         args.layout,
         args.data,
         # The result files take the place of detections that are not given, unless the boxes were made of the masks.
-        run.path
-        if args.detections is None and args.layout != "folder" and not _is_of_masks(args, run)
-        else args.detections,
-        mask_source(args),
+        run.path if args.detections is None and args.layout != "folder" and not of_masks else args.detections,
+        masks,
         frames=run.frame_ids,
         classes=run.classes,
         ground=run.setting("ground"),
@@ -248,11 +248,6 @@ def inputs_of_run(args: argparse.Namespace, run: RunFolder) -> RunInputs:
     dataset = dataset_of_run(args, run) if run.frame_ids else None
     has_detections = args.layout == "folder" or args.detections is not None
     return RunInputs(run, prior_of_run(args.prior, run), dataset, has_detections)
-
-
-def _is_of_masks(args: argparse.Namespace, run: RunFolder) -> bool:
-    """Whether the run's boxes were made of masks, which are given."""
-    return run.manifest.config.get("boxes") == "masks" and mask_source(args) is not None
 
 
 def prior_of_run(source: str | None, run: RunFolder) -> ShapePrior | None:

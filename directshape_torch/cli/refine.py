@@ -87,7 +87,6 @@ def _add_workers(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--workers", type=int, metavar="N", help="processes side by side; default: this one alone")
     group.add_argument(
         "--threads",
-        "--threads-per-worker",
         type=int,
         default=1,
         metavar="N",

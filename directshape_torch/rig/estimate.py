@@ -273,7 +273,7 @@ class RigEstimate(nn.Module):
 
     def metres_per_pixel(self, depth_m: float) -> float:
         """Change in depth, in metres, of a point at `depth_m` for one pixel of disparity."""
-        return depth_m**2 / self._focal_baseline
+        return depth_m**2 / float(self._blank.K_left[0, 0] * -self._blank.T_right_cam[0, 3])
 
     def is_of(self, size_wh: tuple[int, int], K_left: Tensor, K_right: Tensor, T_right_cam: Tensor) -> bool:
         """Whether frames with this size and these matrices come from the rig."""
@@ -286,7 +286,10 @@ class RigEstimate(nn.Module):
     def content(self) -> dict[str, Any]:
         """All evidence of the estimate, for JSON; `of_content` reads it back."""
         size_wh, *matrices = (list(part) if isinstance(part, tuple) else part.tolist() for part in self._blank.rig)
-        pixels = {kind: {n: _plain(x) for n, x in sums._asdict().items()} for kind, sums in self.pixels.items()}
+        pixels = {
+            kind: {name: x.tolist() if isinstance(x, Tensor) else x for name, x in sums._asdict().items()}
+            for kind, sums in self.pixels.items()
+        }
         rig = dict(zip(("K_left", "K_right", "T_right_cam"), matrices, strict=True))
         seen = {name: getattr(self, name).tolist() for name in ("rows", "sizes", "results")}
         return {"size_wh": size_wh, **rig, **seen, "pixels": pixels}
@@ -324,10 +327,6 @@ class RigEstimate(nn.Module):
             raise InputError("state", "what get_extra_state has made", f"something else ({error})") from error
         self._blank, self.rows, self.pixels, self._solved = other._blank, other.rows, other.pixels, None
         self.sizes, self.results = other.sizes, other.results
-
-    @property
-    def _focal_baseline(self) -> float:
-        return float(self._blank.K_left[0, 0] * -self._blank.T_right_cam[0, 3])
 
     def _solve(self) -> tuple[Posterior, DisparityField]:
         if self._solved is None:
@@ -383,7 +382,3 @@ def _kept_rows(rows: Tensor) -> Tensor:
     rows = rows.unique(dim=0)  # type: ignore[no-untyped-call]
     key = (rows[:, :4] * rows.new_tensor([0.754877, 0.569840, 0.430159, 0.324718])).sum(dim=1) % 1
     return rows[key.argsort()[:_MOST_ROWS]]
-
-
-def _plain(value: int | Tensor) -> Any:
-    return value.tolist() if isinstance(value, Tensor) else value

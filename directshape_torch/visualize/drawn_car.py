@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
-from directshape_torch.io.kitti_labels import KittiObject, box_corners_cam, poses_cam
+from directshape_torch.io.kitti_labels import KittiObject, box_corners_cam
 from directshape_torch.refinement.quality import is_front_known
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.scene.detections import Detections
@@ -105,20 +105,6 @@ def corners_cam(location_ref: Tensor, rotation_y: Tensor, hwl: Tensor, t_cam_ref
         x.detach().double().cpu() for x in (location_ref, rotation_y, hwl, t_cam_ref)
     )
     return np.asarray(box_corners(pose_from_kitti(location_ref + t_cam_ref, rotation_y), hwl))
-
-
-def cars_before(
-    objects: Sequence[KittiObject],
-    t_cam_ref: Tensor,  # (3,)
-    mean: trimesh.Trimesh | None,
-    num_codes: int,
-) -> list[DrawnCar]:
-    """The mean shape at the pose of each detection, with the detection's box."""
-    T_cam_obj = poses_cam(objects, t_cam_ref.double().cpu()).numpy()
-    corners, code = box_corners_cam(objects, t_cam_ref.cpu()).numpy(), np.zeros(num_codes)
-    return [
-        DrawnCar(T, box, code, mean, one.line_number) for T, box, one in zip(T_cam_obj, corners, objects, strict=True)
-    ]
 
 
 def cars_after(

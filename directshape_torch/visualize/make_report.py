@@ -87,7 +87,9 @@ def make_report(
 
 def _notes(inputs: RunInputs, num_detailed: int) -> list[str]:
     """Notes about parts of the page that are missing or could not be used."""
-    run, dataset, notes = inputs.run, inputs.dataset, _unfinished(inputs.run.path)
+    run, dataset, notes = inputs.run, inputs.dataset, list[str]()
+    if left := read_status(run.path).num_left:
+        notes.append(f"the run has not finished ({left} frames left): the page is of what is done")
     if dataset is None:
         notes.append("no pictures and no residual maps: the images were not given (--data)")
     if run.manifest.config.get("boxes") == "masks":
@@ -104,12 +106,6 @@ def _notes(inputs: RunInputs, num_detailed: int) -> list[str]:
         notes.append(f"pictures and 3D views of {num_detailed} of {len(run.frame_ids)} frames (--max-frames)")
     found = sorted(inputs.problems.items())
     return notes + [f"{what} ({len(ids)} frame{'s' * (len(ids) != 1)})" for what, ids in found]
-
-
-def _unfinished(out_dir: Path) -> list[str]:
-    """A note on the state of the run if it has not finished."""
-    left = read_status(out_dir).num_left
-    return [f"the run has not finished ({left} frames left): the page is of what is done"] if left else []
 
 
 def _run_facts(

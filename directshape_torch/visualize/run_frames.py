@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.kitti_labels import KittiObject, box_corners_cam, poses_cam
 from directshape_torch.io.run_folder import FrameResult, RunFolder, result_path, shapes_path
 from directshape_torch.io.run_manifest import hash_file, hash_prior
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
@@ -24,7 +24,6 @@ from directshape_torch.visualize.drawing import Array
 from directshape_torch.visualize.drawn_car import (
     DrawnCar,
     cars_after,
-    cars_before,
     corners_cam,
     mean_car,
     true_corners,
@@ -149,7 +148,11 @@ class RunFrame:
         """The cars before the refinement, or None without detections."""
         if self.detections is None:
             return None
-        return cars_before(self.detections, self.t_cam_ref, self.inputs.mean, self.result.shapes.codes.shape[1])
+        # The mean shape stands at the pose of each detection, with the detection's box.
+        code, mean = np.zeros(self.result.shapes.codes.shape[1]), self.inputs.mean
+        T_cam_obj = poses_cam(self.detections, self.t_cam_ref).numpy()
+        states = zip(T_cam_obj, box_corners_cam(self.detections, self.t_cam_ref).numpy(), self.detections, strict=True)
+        return [DrawnCar(T, corners, code, mean, line.line_number) for T, corners, line in states]
 
     @cached_property
     def after(self) -> list[DrawnCar]:

@@ -19,7 +19,7 @@ _FAST = ["--config", "fast"]
 
 
 def test_demo_car(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["inspect", "--demo", "--frame", "0", "--car", "3", *_FAST, "--out", str(tmp_path)]) == 0
+    assert main(["inspect", "--demo", "--frames", "0", "--car", "3", *_FAST, "--out", str(tmp_path)]) == 0
     assert "frame 000000 car 3: " in capsys.readouterr().out
     assert {path.name for path in tmp_path.iterdir()} == {"000000.png", "000000_3"}
     folder = tmp_path / "000000_3"

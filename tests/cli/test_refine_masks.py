@@ -100,9 +100,9 @@ def test_all_that_reads_a_run_reads_this_one(run: Path, masks: Path, tmp_path: P
 def test_the_data_are_checked_and_inspected(masks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check-data", *inputs(masks)]) == 0
     assert "with 7 cars" in capsys.readouterr().out
-    assert main(["inspect", *inputs(masks), "--frame", "0", "--car", "2", "--out", str(tmp_path), *QUICK[:2]]) == 0
+    assert main(["inspect", *inputs(masks), "--frames", "0", "--car", "2", "--out", str(tmp_path), *QUICK[:2]]) == 0
     assert (tmp_path / "000000_2" / "residuals.png").is_file()
-    assert main(["inspect", *inputs(masks), "--frame", "0", "--car", "1", "--out", str(tmp_path), *QUICK[:2]]) == 2
+    assert main(["inspect", *inputs(masks), "--frames", "0", "--car", "1", "--out", str(tmp_path), *QUICK[:2]]) == 2
     assert "no_start" in capsys.readouterr().err
 
 
