@@ -1,7 +1,7 @@
 """`directshape inspect`: figures of single cars.
 
-Refine the cars of a frame and draw the course of each: sampled pixels, residuals, contour, box and costs of each
-iteration, and its drift in a refinement by silhouettes only. docs/outputs.md shows the pictures.
+Refine the cars of a frame and draw the course of each: sampled pixels, residuals, and contour, box and costs of each
+iteration. docs/outputs.md shows the pictures.
 """
 
 from __future__ import annotations
@@ -24,16 +24,10 @@ from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.rig_file import known_rigs
 from directshape_torch.rig.rigs import RigEstimates
-from directshape_torch.visualize.car_figures import (
-    CarCourse,
-    drift_figure,
-    iteration_frames,
-    residual_figure,
-    sampling_figure,
-)
+from directshape_torch.visualize.car_figures import CarCourse, iteration_frames, residual_figure, sampling_figure
 from directshape_torch.visualize.drawing import Picture, write_gif
 from directshape_torch.visualize.overlay import overlay_of_frame
-from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement, without_depth
+from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
 
 _SECONDS_A_FRAME, _SECONDS_AT_END = 0.4, 2.5
 _FIGURES: dict[str, Callable[[CarCourse], Picture]] = {
@@ -105,24 +99,12 @@ def inspect_frame(
     _report(loaded, trace, rows, must_refine)
     write_png(out_dir / f"{loaded.frame_id}.png", overlay_of_frame(loaded, trace.result))
     drawn = [row for row in rows if trace.place_of(row) >= 0]
-    silhouettes = silhouette_trace(refiner, loaded) if drawn else None
     truth = true_corners_cam(loaded)
     for row in Bar(drawn, unit="car", desc=f"frame {loaded.frame_id}"):
         folder, car = out_dir / f"{loaded.frame_id}_{line_of(loaded, row)}", CarCourse(loaded, trace, row, truth[row])
         for name, figure in _FIGURES.items():
             write_png(folder / name, figure(car))
         write_gif(folder / "iterations.gif", iteration_frames(car), _SECONDS_A_FRAME, _SECONDS_AT_END)
-        if silhouettes is not None and silhouettes.place_of(row) >= 0:
-            drift = drift_figure(car, CarCourse(loaded, silhouettes, row, truth[row]))
-            write_png(folder / "drift.png", drift)
-
-
-def silhouette_trace(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> RefinementTrace | None:
-    """The trace of a refinement by silhouettes and priors, or None if the refiner lacks one of the paper's terms."""
-    config = refiner.config
-    if not (config.photometric.weight > 0 and config.silhouette.weight > 0):
-        return None
-    return trace_refinement(without_depth(refiner), loaded.frame, loaded.detections)
 
 
 def _report(loaded: LoadedFrame, trace: RefinementTrace, rows: Sequence[int], must_refine: bool) -> None:

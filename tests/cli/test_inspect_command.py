@@ -8,13 +8,9 @@ import cv2
 import pytest
 from PIL import Image
 
-from directshape_torch.cli.demo import demo_dataset
-from directshape_torch.cli.inspect import silhouette_trace
 from directshape_torch.cli.main import main
-from directshape_torch.io.config_files import load_config
-from directshape_torch.refiner import DirectShapeRefiner
 
-_PICTURES = ("sampling", "residuals", "drift")
+_PICTURES = ("sampling", "residuals")
 _FAST = ["--config", "fast"]
 
 
@@ -30,13 +26,6 @@ def test_demo_car(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert picture.std() > 10
     with Image.open(folder / "iterations.gif") as animation:
         assert animation.n_frames > 3
-
-
-@pytest.mark.parametrize("setting", ["photometric.weight=0", "silhouette.weight=0"])
-def test_without_both_of_the_papers_terms_there_is_no_drift(setting: str) -> None:
-    data = demo_dataset()
-    refiner = DirectShapeRefiner(config=load_config("fast", [setting]))
-    assert silhouette_trace(refiner, data.load("000000")) is None
 
 
 def test_cars_that_cannot_be_refined_are_named_and_passed_by(
