@@ -16,7 +16,7 @@ from directshape_torch.scene.masks import MASK_THRESHOLD
 from directshape_torch.stereo_matching.disparity import rgb8
 from directshape_torch.visualize.drawing import GREEN, GREY, Colour
 from directshape_torch.visualize.painted_cars import ground_grid
-from directshape_torch.visualize.run_frames import Exporter, RunFrame, frame_numbers
+from directshape_torch.visualize.run_frames import Exporter, RunFrame
 
 if TYPE_CHECKING:
     import trimesh
@@ -68,6 +68,18 @@ class RerunExporter(Exporter):
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
         if self._stream is not None:
             self._stream.close(keep=error is None)
+
+
+def frame_numbers(frame_ids: Sequence[str]) -> dict[str, int]:
+    """The numbers in the ids of frames, or 1, 2, .. if the ids are not distinct numbers.
+
+    Examples:
+        >>> frame_numbers(["000107", "007322"])
+        {'000107': 107, '007322': 7322}
+    """
+    if all(one.isdigit() for one in frame_ids) and len({int(one) for one in frame_ids}) == len(frame_ids):
+        return {one: int(one) for one in frame_ids}
+    return {one: number for number, one in enumerate(frame_ids, start=1)}
 
 
 def _log_conventions(stream: _Stream) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -207,10 +207,7 @@ class RunFrame:
 
 
 class Exporter(AbstractContextManager["Exporter"]):
-    """An `Exporter` writes the frames of a run in one format into a folder.
-
-    At its end it writes what needs all frames, or after an error removes what is unfinished.
-    """
+    """An `Exporter` writes the frames of a run in one format into a folder; its end leaves no unfinished file."""
 
     def __init__(self, folder: Path, inputs: RunInputs) -> None:
         self.folder, self.inputs = folder, inputs
@@ -221,15 +218,3 @@ class Exporter(AbstractContextManager["Exporter"]):
 
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
         """Most formats have a file for each frame, and nothing to do here."""
-
-
-def frame_numbers(frame_ids: Sequence[str]) -> dict[str, int]:
-    """The numbers in the ids of frames, or 1, 2, .. if the ids are not distinct numbers.
-
-    Examples:
-        >>> frame_numbers(["000107", "007322"])
-        {'000107': 107, '007322': 7322}
-    """
-    if all(one.isdigit() for one in frame_ids) and len({int(one) for one in frame_ids}) == len(frame_ids):
-        return {one: int(one) for one in frame_ids}
-    return {one: number for number, one in enumerate(frame_ids, start=1)}

@@ -168,18 +168,6 @@ def test_a_damaged_image_leaves_no_file(finished: FinishedRun, tmp_path: Path) -
     assert list((tmp_path / "out").iterdir()) == []
 
 
-@pytest.mark.parametrize("recording_first", [True, False])
-def test_an_end_that_fails_leaves_nothing_half_written(
-    finished: FinishedRun, tmp_path: Path, recording_first: bool
-) -> None:
-    run, out = finished.with_tracks(tmp_path / "run", ("000007", ""), [(0, -1), (0, -1)]), tmp_path / "out"
-    (out / "glb" / "track_000007.glb").mkdir(parents=True)
-    formats = ["rerun", "glb"] if recording_first else ["glb", "rerun"]
-    with pytest.raises(OSError, match=r"track_000007\.glb"):
-        export_run(finished.inputs(run), out, formats)
-    assert {path.name for path in out.iterdir()} == ({"glb"} if recording_first else {"glb", "recording.rrd"})
-
-
 def test_without_rerun_the_error_says_what_to_install(
     finished: FinishedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

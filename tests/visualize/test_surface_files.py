@@ -15,9 +15,7 @@ import torch
 from helpers.finished_run import FinishedRun
 from numpy.typing import NDArray
 from plyfile import PlyData
-from scipy.spatial.transform import Rotation
 
-from directshape_torch.io.frame_layout import FrameFiles
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.visualize.export_run import export_run
@@ -174,49 +172,6 @@ def test_glb_carries_what_is_known_of_a_car(finished: FinishedRun, exported: Pat
     assert extras["line"] == 3
     assert extras["status"] == arrays["statuses"][1]
     np.testing.assert_allclose(extras["dimensions_hwl_m"], arrays["boxes_hwl"][1])
-
-
-# Times that do not go on, as a folder's frames may have them, cannot be those of an animation.
-@pytest.mark.parametrize(("interval_s", "played_s"), [(None, 0.1), (0.25, 0.25), (0.0, 0.1), (-0.25, 0.1)])
-def test_a_car_moves_through_the_poses_of_its_track(
-    finished: FinishedRun, tmp_path: Path, interval_s: float | None, played_s: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if interval_s is not None:
-        motion = {"000000": (7.0, None), "000001": (7.0 + interval_s, None)}
-        monkeypatch.setattr(FrameFiles, "read_motion", lambda files: motion[files.stems[0]])
-    run = finished.with_tracks(tmp_path / "run", ("000007", ""), [(0, -1), (0, -1)])
-    export_run(finished.inputs(run), tmp_path, ["glb"])
-    assert sorted(path.stem for path in (tmp_path / "glb").iterdir()) == ["000000", "000001", "track_000007"]
-    file = glb(tmp_path / "glb" / "track_000007.glb")
-    (animation,) = file.gltf.animations
-    samplers = {each.target.path: animation.samplers[each.sampler] for each in animation.channels}
-    assert all(file.gltf.nodes[each.target.node].name == "car" for each in animation.channels)
-    times = file.gltf.accessors[samplers["rotation"].input]
-    assert (times.min, times.max) == ([0.0], pytest.approx([played_s]))
-    translation, rotation = (
-        file.numbers(samplers[path].output).astype(np.float64) for path in ("translation", "rotation")
-    )
-    points = file.attribute("car", "POSITION").astype(np.float64)
-    for view, frame_id in enumerate(("000000", "000001")):
-        expected = finished.state(frame_id)["T_cam_obj"][0].astype(np.float64)
-        R = Rotation.from_quat(rotation[view]).as_matrix()
-        np.testing.assert_allclose(translation[view], expected[:3, 3], atol=1e-5)
-        np.testing.assert_allclose(R, expected[:3, :3], atol=1e-6)
-    nearest = min(("000000", "000001"), key=lambda name: finished.state(name)["T_cam_obj"][0, 2, 3])
-    T = finished.state(nearest)["T_cam_obj"][0].astype(np.float64)
-    assert np.abs(distances(finished, nearest, 0, points @ T[:3, :3].T + T[:3, 3])).max() < 0.02
-    # A viewer that plays nothing shows the first view, and y is up.
-    np.testing.assert_allclose(file.nodes["car"].translation, translation[0], atol=1e-6)
-    (root,) = file.gltf.scenes[0].nodes
-    np.testing.assert_array_equal(np.array(file.gltf.nodes[root].matrix).reshape(4, 4), np.diag([1.0, -1, -1, 1]))
-
-
-def test_what_shares_no_shape_does_not_move(finished: FinishedRun, tmp_path: Path) -> None:
-    """Of a track that was split each part is a car, if it has two views; its name says which."""
-    run = finished.with_tracks(tmp_path / "run", ("000007", "000008"), [(2, 0), (2, 1)])
-    export_run(finished.inputs(run), tmp_path, ["glb"])
-    moving = [path.stem for path in (tmp_path / "glb").iterdir() if path.stem.startswith("track")]
-    assert moving == ["track_000007_part2"]
 
 
 def ply(path: Path, columns: Sequence[str] = "xyz") -> Floats:
