@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,35 +14,29 @@ from directshape_torch.files.atomic_files import check_folder, write_bytes, writ
 from directshape_torch.files.read_files import read_bytes
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.run_folder import FrameResult, result_path
-from directshape_torch.visualize.rerun_recording import RerunExporter
-from directshape_torch.visualize.run_frames import Exporter, RunFrame, RunInputs
-from directshape_torch.visualize.surface_files import GlbExporter, PlyExporter
+from directshape_torch.visualize.rerun_recording import Recording
+from directshape_torch.visualize.run_frames import RunFrame, RunInputs
+from directshape_torch.visualize.surface_files import write_glb, write_ply
 
 _KITTI_FRAME = "ref: KITTI's rectified camera 0, x right, y down, z forward, metres and radians"
 
 
-class KittiExporter(Exporter):
-    """A `KittiExporter` copies `kitti/data/NNNNNN.txt` unchanged and writes its lines as `kitti/json/NNNNNN.json`."""
-
-    def add(self, frame: RunFrame) -> None:
-        result, frame_id, folder = frame.result, frame.frame_id, self.folder / "kitti"
-        write_bytes(folder / "data" / f"{frame_id}.txt", read_bytes(result_path(self.inputs.run.path, frame_id)))
-        content = {
-            "schema": "directshape kitti results",
-            "schema_version": 1,
-            "frame_id": frame_id,
-            "coordinates": _KITTI_FRAME,
-            "objects": [{**_columns(line), **_refinement(result, line)} for line in result.lines],
-        }
-        write_json(folder / "json" / f"{frame_id}.json", content)
+def write_kitti(folder: Path, frame: RunFrame) -> None:
+    """Copy the result lines of a frame unchanged, and write them as `kitti/json/NNNNNN.json`."""
+    frame_id, lines = frame.frame_id, read_bytes(result_path(frame.inputs.run.path, frame.frame_id))
+    write_bytes(folder / "kitti" / "data" / f"{frame_id}.txt", lines)
+    content = {
+        "schema": "directshape kitti results",
+        "schema_version": 1,
+        "frame_id": frame_id,
+        "coordinates": _KITTI_FRAME,
+        "objects": [{**_columns(line), **_refinement(frame.result, line)} for line in frame.result.lines],
+    }
+    write_json(folder / "kitti" / "json" / f"{frame_id}.json", content)
 
 
-FORMATS: dict[str, type[Exporter]] = {
-    "glb": GlbExporter,
-    "ply": PlyExporter,
-    "kitti": KittiExporter,
-    "rerun": RerunExporter,
-}
+_WRITERS: dict[str, Callable[[Path, RunFrame], None]] = {"glb": write_glb, "ply": write_ply, "kitti": write_kitti}
+FORMATS = (*_WRITERS, "rerun")
 """These are the formats of `export_run` (docs/outputs.md)."""
 
 
@@ -70,13 +65,18 @@ def export_run(
         raise InputError("frames", f"finished frames of {run.path}", "none")
     if unknown := [name for name in formats if name not in FORMATS]:
         raise InputError("formats", f"of {', '.join(FORMATS)}", repr(unknown[0]))
+    folder, wanted = Path(folder), dict.fromkeys(formats)
+    writers: list[Callable[[RunFrame], object]] = [
+        partial(_WRITERS[name], folder) for name in wanted if name in _WRITERS
+    ]
     with ExitStack() as stack:
-        exporters = [stack.enter_context(FORMATS[name](Path(folder), inputs)) for name in dict.fromkeys(formats)]
+        if "rerun" in wanted:
+            writers.append(stack.enter_context(Recording(folder / "recording.rrd", inputs)).add)
         for frame_id in run.frame_ids:
-            # All exporters of a frame share what is read and computed.
+            # All writers of a frame share what is read and computed.
             frame = RunFrame(inputs, frame_id)
-            for exporter in exporters:
-                exporter.add(frame)
+            for write in writers:
+                write(frame)
             tell(frame_id)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from directshape_torch.scene.masks import MASK_THRESHOLD
 from directshape_torch.stereo_matching.disparity import rgb8
 from directshape_torch.visualize.drawing import GREEN, GREY, Colour
 from directshape_torch.visualize.painted_cars import ground_grid
-from directshape_torch.visualize.run_frames import Exporter, RunFrame
+from directshape_torch.visualize.run_frames import RunFrame, RunInputs
 
 if TYPE_CHECKING:
     import trimesh
@@ -28,31 +29,35 @@ _MASK_OPACITY = 0.35
 _MOST_LINES = 255
 
 
-class RerunExporter(Exporter):
-    """A `RerunExporter` writes `recording.rrd`, which has all frames.
+class Recording(AbstractContextManager["Recording"]):
+    """A `Recording` has all frames; it is written when the body ends, and removed if the body fails.
+
+    Args:
+        path: the file to write.
+        inputs: the run with its data set.
 
     Raises:
         MissingDependencyError: Rerun is not installed.
         InputError: there is no data set.
     """
 
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        if self.inputs.dataset is None:
+    def __init__(self, path: Path, inputs: RunInputs) -> None:
+        if inputs.dataset is None:
             raise InputError("--data", "the data set of the run, for the pictures of a recording", "nothing")
         _import_rerun()
-        self.numbers = frame_numbers(self.inputs.run.frame_ids)
+        self._path, self._numbers = path, frame_numbers(inputs.run.frame_ids)
         self._stream: _Stream | None = None
 
     def add(self, frame: RunFrame) -> None:
+        """Add the next frame."""
         loaded = frame.with_images
         if self._stream is None:
             # The viewer's views are fitted to the image size of the first frame.
             height, width = loaded.frame.sizes[0].tolist()
-            self._stream = _Stream(self.folder / "recording.rrd", (width, height))
+            self._stream = _Stream(self._path, (width, height))
             _log_conventions(self._stream)
         stream = self._stream
-        stream.at(self.numbers[frame.frame_id])
+        stream.at(self._numbers[frame.frame_id])
         _log_images(stream, loaded)
         _log_boxes(stream, frame)
         ground = ground_grid(loaded.frame.ground.normal[0], float(loaded.frame.ground.offset[0]))

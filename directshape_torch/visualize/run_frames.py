@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -204,17 +203,3 @@ class RunFrame:
 
     def _note(self, problem: str) -> None:
         self.inputs.problems.setdefault(problem, set()).add(self.frame_id)
-
-
-class Exporter(AbstractContextManager["Exporter"]):
-    """An `Exporter` writes the frames of a run in one format into a folder; its end leaves no unfinished file."""
-
-    def __init__(self, folder: Path, inputs: RunInputs) -> None:
-        self.folder, self.inputs = folder, inputs
-
-    def add(self, frame: RunFrame) -> None:
-        """Add the next frame."""
-        raise NotImplementedError
-
-    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
-        """Most formats have a file for each frame, and nothing to do here."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.files.mesh_files import T_GLTF_CAM
 from directshape_torch.visualize.painted_cars import Paint, ground_grid
-from directshape_torch.visualize.run_frames import Exporter, RunFrame
+from directshape_torch.visualize.run_frames import RunFrame
 
 if TYPE_CHECKING:
     import trimesh
@@ -21,11 +22,15 @@ _GREY_OF_GROUND = (120, 120, 120)
 _UNSIGNED_SHORT = 5123
 
 
-class GlbExporter(Exporter):
-    """A `GlbExporter` writes `glb/NNNNNN.glb`, a scene of each frame."""
+def write_glb(folder: Path, frame: RunFrame) -> None:
+    """Write `glb/NNNNNN.glb`, a scene of the frame."""
+    write_bytes(folder / "glb" / f"{frame.frame_id}.glb", frame_glb(frame))
 
-    def add(self, frame: RunFrame) -> None:
-        write_bytes(self.folder / "glb" / f"{frame.frame_id}.glb", frame_glb(frame))
+
+def write_ply(folder: Path, frame: RunFrame) -> None:
+    """Write `ply/NNNNNN_LINE.ply`: surfaces with normals, sRGB and `color_source` (see `Paint`)."""
+    for index, car in enumerate(frame.painted.cars):
+        write_bytes(folder / "ply" / f"{frame.frame_id}_{car.line}.ply", _ply(*frame.painted.mesh(index)))
 
 
 def frame_glb(frame: RunFrame) -> bytes:
@@ -92,15 +97,6 @@ def _finish(tree: dict[str, Any]) -> None:
             accessor["normalized"] = True
             assert accessor["componentType"] == _UNSIGNED_SHORT, "colours of 16 bits"
             primitive["material"] = 0
-
-
-class PlyExporter(Exporter):
-    """A `PlyExporter` writes `ply/NNNNNN_LINE.ply`: surfaces with normals, sRGB and `color_source` (see `Paint`)."""
-
-    def add(self, frame: RunFrame) -> None:
-        for index, car in enumerate(frame.painted.cars):
-            path = self.folder / "ply" / f"{frame.frame_id}_{car.line}.ply"
-            write_bytes(path, _ply(*frame.painted.mesh(index)))
 
 
 def _ply(mesh: trimesh.Trimesh, paint: Paint) -> bytes:
