@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,13 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.batch.options import RefineOptions
-from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_png, write_text
 from directshape_torch.geometry.box3d import alpha_from_kitti
 from directshape_torch.io.result_files import (
     RefinedBox,
     ShapeArrays,
-    read_shapes,
     track_name,
     write_result_text,
     write_shapes,
@@ -31,7 +28,6 @@ from directshape_torch.io.run_folder import (
     failure_path,
     frame_entry,
     overlay_path,
-    read_record,
     result_path,
     shapes_path,
 )
@@ -55,8 +51,6 @@ def write_frame_outputs(
     `run`, `prior_sha256` and `inputs` are hashes of the manifest, of the shape prior and of the frame's input files.
     The result is the frame's entry.
     """
-    path = shapes_path(out_dir, loaded.frame_id)
-    earlier = _earlier_record(path, run, inputs)
     files = [result_path(out_dir, loaded.frame_id)]
     if options.draw is not None:
         files.append(overlay_path(out_dir, loaded.frame_id))
@@ -65,21 +59,10 @@ def write_frame_outputs(
     shapes = _shape_arrays(loaded, result, boxes, prior_sha256)
     write_result_text(files[0], loaded.input_objects, refined_boxes(boxes, result.refined, loaded.row_of_detection))
     hashes = {file.relative_to(out_dir).as_posix(): hash_bytes(file.read_bytes()) for file in files}
-    outputs, masks_right = set(options.outputs), int(loaded.detections.has_mask_right.sum())
-    # Files of an earlier run with the same inputs are kept.
-    if earlier is not None:
-        hashes, outputs = {**earlier.files, **hashes}, outputs.union(earlier.outputs)
-    record = FrameRecord(run, inputs, sorted(outputs), hashes, len(loaded.input_objects), masks_right)
-    write_shapes(path, replace(shapes, made_of=record.text()))
+    masks_right = int(loaded.detections.has_mask_right.sum())
+    record = FrameRecord(run, inputs, sorted(options.outputs), hashes, len(loaded.input_objects), masks_right)
+    write_shapes(shapes_path(out_dir, loaded.frame_id), replace(shapes, made_of=record.text()))
     return frame_entry(shapes, record)
-
-
-def _earlier_record(path: Path, run: str, inputs: Mapping[str, str]) -> FrameRecord | None:
-    """The record of earlier files if they were made by the same run from the same inputs, else None."""
-    with suppress(DataFormatError):
-        record = read_record(path, read_shapes(path))
-        return record if (record.run, record.inputs) == (run, inputs) else None
-    return None
 
 
 def refined_boxes(boxes: KittiBoxes, refined: Tensor, rows: Sequence[int]) -> dict[int, RefinedBox]:

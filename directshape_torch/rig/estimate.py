@@ -300,15 +300,15 @@ class RigEstimate(nn.Module):
         try:
             width, height = (int(n) for n in content["size_wh"])
             sizes = {"K_left": 3, "K_right": 3, "T_right_cam": 4}
-            rig = cls((width, height), *(to_tensor(content, name, (n, n)) for name, n in sizes.items()))
-            rig.add_rows(to_tensor(content, "rows", (None, len(COLUMNS))))
+            rig = cls((width, height), *(_tensor_of(content, name, (n, n)) for name, n in sizes.items()))
+            rig.add_rows(_tensor_of(content, "rows", (None, len(COLUMNS))))
             # Files of earlier versions hold neither sizes nor results.
             content = {"sizes": [], "results": [], **content}
-            rig.add_sizes(to_tensor(content, "sizes", (None, len(COLUMNS))))
-            rig.add_results(to_tensor(content, "results", (None, detector_noise.NUM_COLUMNS)))
+            rig.add_sizes(_tensor_of(content, "sizes", (None, len(COLUMNS))))
+            rig.add_results(_tensor_of(content, "results", (None, detector_noise.NUM_COLUMNS)))
             for kind, sums in content["pixels"].items():
                 points, frames, *names = PixelEvidence._fields
-                tensors = (to_tensor(sums, name, shape) for name, shape in zip(names, _OF_PIXELS, strict=True))
+                tensors = (_tensor_of(sums, name, shape) for name, shape in zip(names, _OF_PIXELS, strict=True))
                 rig.add_pixels(kind, PixelEvidence(int(sums[points]), int(sums[frames]), *tensors))
         except DAMAGE as error:
             raise InputError("content", "that of an estimate", f"another ({error!r})") from error
@@ -355,7 +355,7 @@ class RigEstimate(nn.Module):
         return hull(uv) if len(uv) else self._blank.hull_uv
 
 
-def to_tensor(entry: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) -> Tensor:
+def _tensor_of(entry: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) -> Tensor:
     """Numbers by name in the content of a JSON file, float64, else `ValueError`; None in `shape` is any size."""
     try:
         tensor = torch.tensor(entry[name], dtype=torch.float64)

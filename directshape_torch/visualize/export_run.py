@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from directshape_torch.errors import InputError
-from directshape_torch.files.atomic_files import check_folder, write_bytes, write_json
+from directshape_torch.files.atomic_files import check_folder, json_values, write_bytes, write_json
 from directshape_torch.files.read_files import read_bytes
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.run_folder import FrameResult, result_path
@@ -109,11 +108,4 @@ def _refinement(result: FrameResult, line: KittiObject) -> dict[str, Any]:
         "mask_iou_right": shapes.mask_iou_right[car],
         "code": shapes.codes[car],
     }
-    return {"status": shapes.statuses[car], **{name: _numbers(value.tolist()) for name, value in known.items()}}
-
-
-def _numbers(values: float | list[float]) -> Any:
-    """The values with None for NaN and infinity, which JSON does not have."""
-    if isinstance(values, list):
-        return [_numbers(value) for value in values]
-    return values if math.isfinite(values) else None
+    return {"status": shapes.statuses[car], **json_values(known)}

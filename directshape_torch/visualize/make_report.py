@@ -112,7 +112,8 @@ def _run_facts(
     run: RunFolder, rows: Sequence[CarRow], entries: Mapping[str, FrameEntry], notes: Sequence[str]
 ) -> dict[str, Any]:
     """The top of the page as JSON: counts, settings, mean errors, and notes about the page."""
-    manifest = run.manifest
+    manifest, rigs, picture = run.manifest, _rigs(run), run.path / RIG_PICTURE
+    drawn = data_url(read_rgb(picture)) if rigs and picture.is_file() else None
     return {
         "name": run.path.resolve().name,
         "package_version": manifest.package_version,
@@ -126,17 +127,9 @@ def _run_facts(
         "settings": {name: str(value) for name, value in sorted(flatten(manifest.config).items())},
         "errors": _mean_errors(rows),
         "notes": list(notes),
-        "verdict": verdict(entries, _rigs(run)),
-        "rig": _rig(run),
+        "verdict": verdict(entries, rigs),
+        "rig": {"words": [str(rig) for rig in rigs], "picture": drawn} if rigs else None,
     }
-
-
-def _rig(run: RunFolder) -> dict[str, Any] | None:
-    """The run's estimates of its rigs, in words and as a picture, or None if there are none."""
-    rigs, picture = _rigs(run), run.path / RIG_PICTURE
-    if not rigs:
-        return None
-    return {"words": [str(rig) for rig in rigs], "picture": data_url(read_rgb(picture)) if picture.is_file() else None}
 
 
 def _rigs(run: RunFolder) -> list[RigEstimate]:
