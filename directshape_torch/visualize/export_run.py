@@ -13,7 +13,7 @@ from directshape_torch.files.atomic_files import check_folder, json_values, writ
 from directshape_torch.files.read_files import read_bytes
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.run_folder import FrameResult, result_path
-from directshape_torch.visualize.rerun_recording import Recording
+from directshape_torch.visualize.rerun_recording import recording
 from directshape_torch.visualize.run_frames import RunFrame, RunInputs
 from directshape_torch.visualize.surface_files import write_glb, write_ply
 
@@ -70,7 +70,7 @@ def export_run(
     ]
     with ExitStack() as stack:
         if "rerun" in wanted:
-            writers.append(stack.enter_context(Recording(folder / "recording.rrd", inputs)).add)
+            writers.append(stack.enter_context(recording(folder / "recording.rrd", inputs)))
         for frame_id in run.frame_ids:
             # All writers of a frame share what is read and computed.
             frame = RunFrame(inputs, frame_id)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import InputError, MissingDependencyError
+from directshape_torch.files.atomic_files import replaced_file
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.scene.masks import MASK_THRESHOLD
 from directshape_torch.stereo_matching.disparity import rgb8
@@ -29,50 +29,49 @@ _MASK_OPACITY = 0.35
 _MOST_LINES = 255
 
 
-class Recording(AbstractContextManager["Recording"]):
-    """A `Recording` has all frames; it is written when the body ends, and removed if the body fails.
-
-    Args:
-        path: the file to write.
-        inputs: the run with its data set.
+@contextmanager
+def recording(path: Path, inputs: RunInputs) -> Iterator[Callable[[RunFrame], None]]:
+    """A function that adds a frame to a recording, which is written when the body ends.
 
     Raises:
         MissingDependencyError: Rerun is not installed.
         InputError: there is no data set.
     """
+    if inputs.dataset is None:
+        raise InputError("--data", "the data set of the run, for the pictures of a recording", "nothing")
+    try:
+        import rerun
+    except ImportError as error:
+        raise MissingDependencyError("rerun-sdk", "viewer", "a Rerun recording") from error
+    numbers = frame_numbers(inputs.run.frame_ids)
+    with replaced_file(path) as file:
+        stream = _Stream(rerun, file.name)
+        try:
+            yield lambda frame: _add(stream, frame, numbers[frame.frame_id])
+        finally:
+            stream.close()
 
-    def __init__(self, path: Path, inputs: RunInputs) -> None:
-        if inputs.dataset is None:
-            raise InputError("--data", "the data set of the run, for the pictures of a recording", "nothing")
-        _import_rerun()
-        self._path, self._numbers = path, frame_numbers(inputs.run.frame_ids)
-        self._stream: _Stream | None = None
 
-    def add(self, frame: RunFrame) -> None:
-        """Add the next frame."""
-        loaded = frame.with_images
-        if self._stream is None:
-            # The viewer's views are fitted to the image size of the first frame.
-            height, width = loaded.frame.sizes[0].tolist()
-            self._stream = _Stream(self._path, (width, height))
-            _log_conventions(self._stream)
-        stream = self._stream
-        stream.at(self._numbers[frame.frame_id])
-        _log_images(stream, loaded)
-        _log_boxes(stream, frame)
-        ground = ground_grid(loaded.frame.ground.normal[0], float(loaded.frame.ground.offset[0]))
-        stream.log_mesh("world/ground", ground, GREY)
-        # The cars of other frames are not shown.
-        stream.log("world/cars", stream.rr.Clear(recursive=True))
-        for index, row in enumerate(frame.refined):
-            # All frames of a track use one name.
-            track = frame.result.shapes.tracks[row]
-            surface, paint = frame.painted.mesh(index)
-            stream.log_mesh(f"world/cars/{f'track_{track}' if track else frame.after[row].line}", surface, paint.rgb)
-
-    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
-        if self._stream is not None:
-            self._stream.close(keep=error is None)
+def _add(stream: _Stream, frame: RunFrame, number: int) -> None:
+    """Log everything of a frame at its number on the timeline."""
+    loaded = frame.with_images
+    if not stream.has_begun:
+        # The viewer's views are fitted to the image size of the first frame.
+        height, width = loaded.frame.sizes[0].tolist()
+        stream.begin((width, height))
+        _log_conventions(stream)
+    stream.at(number)
+    _log_images(stream, loaded)
+    _log_boxes(stream, frame)
+    ground = ground_grid(loaded.frame.ground.normal[0], float(loaded.frame.ground.offset[0]))
+    stream.log_mesh("world/ground", ground, GREY)
+    # The cars of other frames are not shown.
+    stream.log("world/cars", stream.rr.Clear(recursive=True))
+    for index, row in enumerate(frame.refined):
+        # All frames of a track use one name.
+        track = frame.result.shapes.tracks[row]
+        surface, paint = frame.painted.mesh(index)
+        stream.log_mesh(f"world/cars/{f'track_{track}' if track else frame.after[row].line}", surface, paint.rgb)
 
 
 def frame_numbers(frame_ids: Sequence[str]) -> dict[str, int]:
@@ -125,26 +124,20 @@ def _log_boxes(stream: _Stream, frame: RunFrame) -> None:
     stream.log_boxes("world/boxes/truth", truth, [GREEN] * len(truth), ["truth"] * len(truth))
 
 
-def _import_rerun() -> Any:
-    try:
-        import rerun
-    except ImportError as error:
-        raise MissingDependencyError("rerun-sdk", "viewer", "a Rerun recording") from error
-    return rerun
-
-
 class _Stream:
-    """A `_Stream` writes a recording to a temporary file, and moves it to its path when it is complete."""
+    """A `_Stream` writes what is logged to a file, from its beginning on."""
 
-    def __init__(self, path: Path, size_wh: tuple[int, int]) -> None:
-        self.rr, self.path = _import_rerun(), path
-        self._temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._stream = self.rr.RecordingStream("directshape", send_properties=False)
-        self._stream.save(self._temporary, default_blueprint=_blueprint(size_wh))
+    def __init__(self, rerun: Any, path: str) -> None:
+        self.rr, self._path, self.has_begun = rerun, path, False
+        self._stream = rerun.RecordingStream("directshape", send_properties=False)
+
+    def begin(self, size_wh: tuple[int, int]) -> None:
+        """Open the file with a layout for images of this size."""
+        self._stream.save(self._path, default_blueprint=_blueprint(size_wh))
         # The time of logging does not belong to the refinement.
         self._stream.set_log_time_enabled(False)
         self._stream.set_log_tick_enabled(False)
+        self.has_begun = True
 
     def at(self, frame: int) -> None:
         """Set the place on the timeline for what is logged next."""
@@ -192,14 +185,10 @@ class _Stream:
         )
         self.log(entity, boxes)
 
-    def close(self, keep: bool) -> None:
-        """Write the end and move the file to its path, or remove it."""
+    def close(self) -> None:
+        """Write the end of the file."""
         self._stream.flush()
         self._stream.disconnect()
-        if keep:
-            os.replace(self._temporary, self.path)
-        else:
-            self._temporary.unlink(missing_ok=True)
 
 
 def _blueprint(size_wh: tuple[int, int]) -> Any:
