@@ -251,13 +251,11 @@ def inputs_of_run(args: argparse.Namespace, run: RunFolder) -> RunInputs:
 
 
 def prior_of_run(source: str | None, run: RunFolder) -> ShapePrior | None:
-    """The named prior, which must be the run's, or the run's bundled prior; None if the run used another one."""
-    wanted = run.manifest.sha256["prior"]
-    priors = map(load_prior, BUNDLED_PRIORS if source is None else (source,))
-    found = next((prior for prior in priors if hash_prior(prior) == wanted), None)
-    if found is None and source is not None:
-        raise InputError("--prior", f"the prior of the run (sha256 {str(wanted)[:12]})", f"another one, {source}")
-    return found
+    """The named prior, or the run's bundled prior; None if the run used another one."""
+    if source is not None:
+        return load_prior(source)
+    bundled = map(load_prior, BUNDLED_PRIORS)
+    return next((prior for prior in bundled if hash_prior(prior) == run.manifest.sha256["prior"]), None)
 
 
 def _fields_of_run(rig: str, run: RunFolder) -> tuple[DisparityField, ...]:

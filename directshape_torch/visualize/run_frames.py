@@ -52,8 +52,9 @@ class RunInputs:
     problems: dict[str, set[str]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.prior is not None and hash_prior(self.prior) != self.run.manifest.sha256["prior"]:
-            raise InputError("prior", "that of the run", "another one", "name that of the run with --prior")
+        wanted = self.run.manifest.sha256["prior"]
+        if self.prior is not None and hash_prior(self.prior) != wanted:
+            raise InputError("--prior", f"the prior of the run (sha256 {wanted[:12]})", "another one")
 
     @cached_property
     def mean(self) -> trimesh.Trimesh | None:

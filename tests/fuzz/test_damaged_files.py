@@ -52,7 +52,7 @@ def test_damaged_files(whole: dict[str, Sample], name: str, tries: int) -> None:
     read()
     for error in errors:
         # In a whole folder another file, or the prior, may not fit the damaged one.
-        of_others = "/out/" in str(error) or "that of the run" in str(error) or isinstance(error, ResumeError)
+        of_others = "/out/" in str(error) or "the prior of the run" in str(error) or isinstance(error, ResumeError)
         assert sample.path.stem in str(error) or of_others
         assert len(str(error)) < 2500
     assert errors or not sample.is_exact

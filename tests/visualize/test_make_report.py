@@ -145,7 +145,7 @@ def test_detections_are_looked_for_in_all_frames_and_images_where_there_are_pict
 
 
 def test_another_prior_is_refused(finished: FinishedRun) -> None:
-    with pytest.raises(InputError, match="that of the run"):
+    with pytest.raises(InputError, match="the prior of the run"):
         RunInputs(finished.folder(), PCAShapePrior.load_bundled(), finished.dataset)
 
 
