@@ -55,5 +55,5 @@ def kitti_copy(shared_kitti: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
-    """A finished run with meshes for reports and exports that no test changes."""
-    return finished_run(tmp_path_factory.mktemp("finished"), meshes="glb")
+    """A finished run for reports and exports that no test changes."""
+    return finished_run(tmp_path_factory.mktemp("finished"))

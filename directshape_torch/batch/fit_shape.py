@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig, RefinerConfig, RigConfig
@@ -57,18 +54,6 @@ class ShapeFit:
     num_points: Tensor
     distance_before_m: Tensor
     distance_after_m: Tensor
-
-    def arrays(self, frame: str, **more: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Arrays for a file: poses `T_FRAME_obj`, codes, numbers of points, distances, `more`, statuses."""
-        tensors = {
-            f"T_{frame}_obj": self.cars.T_cam_obj,
-            "codes": self.cars.code,
-            "num_points": self.num_points,
-            "distances_before_m": self.distance_before_m,
-            "distances_after_m": self.distance_after_m,
-        }
-        arrays = {name: each.numpy() for name, each in tensors.items()}
-        return {**arrays, **more, "statuses": np.array([each.name for each in self.cars.status], dtype=np.str_)}
 
 
 @full_precision()

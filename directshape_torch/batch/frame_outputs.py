@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.batch.options import MeshFormat, RefineOptions
-from directshape_torch.errors import DataFormatError
-from directshape_torch.files.atomic_files import write_bytes, write_png, write_text
-from directshape_torch.files.mesh_files import T_GLTF_CAM
+from directshape_torch.batch.options import RefineOptions
+from directshape_torch.files.atomic_files import write_png, write_text
 from directshape_torch.geometry.box3d import alpha_from_kitti
-from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.result_files import (
     RefinedBox,
     ShapeArrays,
-    read_shapes,
     track_name,
     write_result_text,
     write_shapes,
@@ -32,9 +27,7 @@ from directshape_torch.io.run_folder import (
     FrameRecord,
     failure_path,
     frame_entry,
-    mesh_path,
     overlay_path,
-    read_record,
     result_path,
     shapes_path,
 )
@@ -42,9 +35,6 @@ from directshape_torch.io.run_manifest import hash_bytes
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refinement.result import KittiBoxes, RefinementResult
 from directshape_torch.status import Status
-
-if TYPE_CHECKING:
-    import trimesh
 
 
 def write_frame_outputs(
@@ -61,11 +51,7 @@ def write_frame_outputs(
     `run`, `prior_sha256` and `inputs` are hashes of the manifest, of the shape prior and of the frame's input files.
     The result is the frame's entry.
     """
-    path = shapes_path(out_dir, loaded.frame_id)
-    earlier = _earlier_record(path, run, inputs)
     files = [result_path(out_dir, loaded.frame_id)]
-    if options.meshes is not None:
-        files += write_meshes(out_dir, loaded.frame_id, loaded.detected_objects, result, options.meshes)
     if options.draw is not None:
         files.append(overlay_path(out_dir, loaded.frame_id))
         write_png(files[-1], options.draw(loaded, result))
@@ -73,36 +59,10 @@ def write_frame_outputs(
     shapes = _shape_arrays(loaded, result, boxes, prior_sha256)
     write_result_text(files[0], loaded.input_objects, refined_boxes(boxes, result.refined, loaded.row_of_detection))
     hashes = {file.relative_to(out_dir).as_posix(): hash_bytes(file.read_bytes()) for file in files}
-    outputs, masks_right = set(options.outputs), int(loaded.detections.has_mask_right.sum())
-    # Files of an earlier run with the same inputs are kept.
-    if earlier is not None:
-        hashes, outputs = {**earlier.files, **hashes}, outputs.union(earlier.outputs)
-    record = FrameRecord(run, inputs, sorted(outputs), hashes, len(loaded.input_objects), masks_right)
-    write_shapes(path, replace(shapes, made_of=record.text()))
+    masks_right = int(loaded.detections.has_mask_right.sum())
+    record = FrameRecord(run, inputs, sorted(options.outputs), hashes, len(loaded.input_objects), masks_right)
+    write_shapes(shapes_path(out_dir, loaded.frame_id), replace(shapes, made_of=record.text()))
     return frame_entry(shapes, record)
-
-
-def _earlier_record(path: Path, run: str, inputs: Mapping[str, str]) -> FrameRecord | None:
-    """The record of earlier files if they were made by the same run from the same inputs, else None."""
-    with suppress(DataFormatError):
-        record = read_record(path, read_shapes(path))
-        return record if (record.run, record.inputs) == (run, inputs) else None
-    return None
-
-
-def write_meshes(
-    out_dir: Path | str, frame_id: str, lines: Sequence[KittiObject], result: RefinementResult, mesh_format: MeshFormat
-) -> list[Path]:
-    """Write the surface of each refined car in the left camera frame, metres, and return the files.
-
-    GLB files have the vertices of PLY files below a node that rotates them to glTF's axes (y up).
-    """
-    paths, refined = [], result.refined.tolist()
-    for car, line in enumerate(lines):
-        if refined[car]:
-            paths.append(mesh_path(out_dir, frame_id, line.line_number, mesh_format))
-            write_bytes(paths[-1], _mesh_bytes(result.mesh(car), mesh_format))
-    return paths
 
 
 def refined_boxes(boxes: KittiBoxes, refined: Tensor, rows: Sequence[int]) -> dict[int, RefinedBox]:
@@ -110,18 +70,6 @@ def refined_boxes(boxes: KittiBoxes, refined: Tensor, rows: Sequence[int]) -> di
     hwl, location, yaw = (each.double().cpu() for each in (boxes.dimensions_hwl, boxes.location_ref, boxes.rotation_y))
     columns = torch.cat([alpha_from_kitti(location, yaw)[:, None], hwl, location, yaw[:, None]], dim=1).tolist()
     return {row: columns[car] for car, row in enumerate(rows) if refined[car]}
-
-
-def _mesh_bytes(mesh: trimesh.Trimesh, mesh_format: MeshFormat) -> bytes:
-    import trimesh
-    from trimesh.exchange import gltf, ply
-
-    to_glb: Callable[..., bytes] = gltf.export_glb
-    if mesh_format == "ply":
-        return cast(bytes, ply.export_ply(mesh))
-    scene = trimesh.Scene()
-    scene.add_geometry(mesh, node_name="car", geom_name="car", transform=T_GLTF_CAM)
-    return to_glb(scene, include_normals=True)
 
 
 def _shape_arrays(loaded: LoadedFrame, result: RefinementResult, boxes: KittiBoxes, prior_sha256: str) -> ShapeArrays:

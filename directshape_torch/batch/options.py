@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,15 +12,12 @@ from directshape_torch.errors import InputError
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refinement.result import RefinementResult
 
-MeshFormat = Literal["ply", "glb"]
-
 
 @dataclass(frozen=True)
 class RefineOptions:
     """A `RefineOptions` has the outputs of `refine_dataset` and its processes.
 
     Attributes:
-        meshes: format of the surface of each refined car, "ply" or "glb"; None writes none.
         draw: function that draws the overlay of each frame (`visualize.overlay.overlay_of_frame`); None writes none.
             Workers import it by its name.
         batch_frames: number of frames refined together in one call.
@@ -30,16 +26,13 @@ class RefineOptions:
         ray: address "HOST:PORT" of a cluster of Ray, whose processes are the workers (docs/many_machines.md).
 
     Raises:
-        InputError: an unknown mesh format, a number that is too small, or both `workers` and `ray`.
+        InputError: a number is too small, or both `workers` and `ray` are given.
 
     Examples:
-        >>> RefineOptions(meshes="ply").outputs
-        ('data', 'shapes', 'meshes_ply')
         >>> RefineOptions(workers=4).threads_per_worker
         1
     """
 
-    meshes: MeshFormat | None = None
     draw: Callable[[LoadedFrame, RefinementResult], NDArray[np.uint8]] | None = None
     batch_frames: int = 1
     workers: int | None = None
@@ -47,8 +40,6 @@ class RefineOptions:
     ray: str | None = None
 
     def __post_init__(self) -> None:
-        if self.meshes is not None and self.meshes not in get_args(MeshFormat):
-            raise InputError("meshes", f"one of {', '.join(get_args(MeshFormat))}, or None", repr(self.meshes))
         for name in ("batch_frames", "workers", "threads"):
             number = getattr(self, name)
             if number is not None and number < 1:
@@ -59,8 +50,7 @@ class RefineOptions:
     @property
     def outputs(self) -> tuple[str, ...]:
         """Names of the kinds of files that each frame gets."""
-        meshes = () if self.meshes is None else (f"meshes_{self.meshes}",)
-        return ("data", "shapes", *meshes, *(() if self.draw is None else ("overlays",)))
+        return ("data", "shapes") if self.draw is None else ("data", "shapes", "overlays")
 
     @property
     def threads_per_worker(self) -> int | None:

@@ -28,7 +28,7 @@ from directshape_torch.batch.run_summary import RunSummary, RunTimings, digit_wa
 from directshape_torch.errors import InputError
 from directshape_torch.files.atomic_files import check_folder
 from directshape_torch.io.config_files import config_to_mapping
-from directshape_torch.io.result_files import read_shapes, write_tracks
+from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import FrameEntry, overlay_path, result_path, shapes_path
 from directshape_torch.io.run_manifest import RunManifest, SharedHashes, hash_fields, hash_prior
 from directshape_torch.io.stereo_dataset import StereoDataset
@@ -114,7 +114,7 @@ class _Run:
             self._refine(groups)
         self._look_for_files()
         if has_tracks(self.dataset):
-            self._write_tracks(sorted(name for name, entry in self.ends.items() if "reason" not in entry))
+            self._look_for_split_tracks()
         # A folder that another run has taken, or that was moved away, is found here.
         join_summary(self.out_dir, manifest)
         return self._summary(resumed)
@@ -148,9 +148,11 @@ class _Run:
             self.ends[frame_id] = entry
             self.observer.finished(frame_id, entry.get("reason"))
 
-    def _write_tracks(self, frame_ids: Sequence[str]) -> None:
-        frames = (read_shapes(shapes_path(self.out_dir, frame_id)) for frame_id in frame_ids)
-        if split := write_tracks(self.out_dir, frames):
+    def _look_for_split_tracks(self) -> None:
+        done = [frame_id for frame_id, entry in self.ends.items() if "reason" not in entry]
+        frames = [read_shapes(shapes_path(self.out_dir, frame_id)) for frame_id in done]
+        views = [view for shapes in frames for view in zip(shapes.tracks, shapes.track_parts, strict=True)]
+        if split := sorted({track for track, part in views if part > 0}):
             self.warnings.append(f"tracks seem to be of two cars, and were split (docs/tracks.md): {_some(split)}")
 
     def _look_for_files(self) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -39,9 +38,7 @@ from directshape_torch.io.stereo_dataset import StereoDataset
 
 # Hashing mostly waits for the disk or the network, so several threads read at a time.
 _READING_THREADS = 8
-_MESH = re.compile(r"(.+)_[0-9]{1,9}\.(ply|glb)")
-_TRACK = re.compile(r"(.+_)?[0-9]{6,}\.npz")
-OUTPUT_FOLDERS = ("data", "shapes", "meshes", "overlays", "tracks", "failed")
+OUTPUT_FOLDERS = ("data", "shapes", "overlays", "failed")
 # A file is written within moments, but clocks of machines differ.
 _STALE_S = 3600.0
 
@@ -151,16 +148,9 @@ def remove_results(out_dir: Path) -> bool:
     previous = read_manifest(summary_path(out_dir))
     if previous is None:
         return False
-    frame_ids = {*previous.frames, *done_frames(out_dir)}
-    for frame_id in frame_ids:
+    for frame_id in {*previous.frames, *done_frames(out_dir)}:
         for path_of in (result_path, shapes_path, overlay_path, failure_path):
             path_of(out_dir, frame_id).unlink(missing_ok=True)
-    for mesh in (out_dir / "meshes").glob("*"):
-        if (found := _MESH.fullmatch(mesh.name)) is not None and found[1] in frame_ids:
-            mesh.unlink()
-    for track in (out_dir / "tracks").glob("*.npz"):
-        if _TRACK.fullmatch(track.name) is not None:
-            track.unlink()
     for path in (out_dir / TIMINGS, summary_path(out_dir)):
         path.unlink(missing_ok=True)
     for name in OUTPUT_FOLDERS:

@@ -27,22 +27,22 @@ _FEWEST_CARS = 10  # with fewer cars the noise of a detector is not known
 
 
 def check_dataset(
-    dataset: StereoDataset, max_frames: int | None = 20, tell: Callable[[str], object] = lambda _: None
+    dataset: StereoDataset, max_frames: int = 20, tell: Callable[[str], object] = lambda _: None
 ) -> CheckReport:
     """Check a data set for common mistakes.
 
     Args:
         dataset: data set of any layout.
-        max_frames: number of frames whose content is read, evenly spread; None reads all. The existence of files is
-            checked for all frames.
+        max_frames: largest number of frames whose content is read, evenly spread. The existence of files is checked
+            for all frames.
         tell: function that is called after each frame that was read.
 
     Raises:
         InputError: `max_frames` is below 1.
     """
-    if max_frames is not None and max_frames < 1:
+    if max_frames < 1:
         raise InputError("max_frames", "at least 1", str(max_frames))
-    number = len(dataset) if max_frames is None else min(max_frames, len(dataset))
+    number = min(max_frames, len(dataset))
     chosen = [dataset.frame_ids[index * len(dataset) // number] for index in range(number)]
     findings, num_cars = check_frames(dataset, chosen, tell)
     findings = [*_check_files(dataset), *findings]

@@ -31,7 +31,7 @@ from directshape_torch.rig.from_files import (
     open_sequence,
     truth_files,
 )
-from directshape_torch.rig.rig_file import load_rigs, save_rigs
+from directshape_torch.rig.rig_file import known_rigs, save_rigs
 from directshape_torch.rig.rigs import rig_among
 from directshape_torch.rig.self_calibration import self_calibrate
 from directshape_torch.visualize.rig_picture import draw_rigs
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out.suffix == ".png":
         raise InputError("--out", "another ending than .png, which is that of the picture", str(args.out))
     check_file("--out", args.out)
-    rigs = [] if args.rig == "none" else load_rigs(args.rig)
+    rigs = known_rigs(args.rig)
     for source in dict.fromkeys(args.sources):
         if source in ("detections", "sizes"):
             dataset = dataset_of(args)

@@ -34,7 +34,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="frames whose content is read, spread evenly (default: 20); files are looked for in all of them",
     )
-    group.add_argument("--all-frames", action="store_true", help="read the content of all frames")
     group.add_argument("--json", type=Path, metavar="FILE", help="write all findings; '-' prints them instead of text")
 
 
@@ -52,10 +51,9 @@ def run(args: argparse.Namespace) -> int:
 
 def _report(args: argparse.Namespace) -> CheckReport:
     """Check the data set; a data set that cannot be opened has one finding that says why."""
-    max_frames = None if args.all_frames else args.max_frames
     try:
         dataset = dataset_of(args)
     except DataFormatError as error:
         return CheckReport((unreadable("layout", "all frames", error, layout=args.layout),), 0, 0, 0)
-    with Bar(total=min(len(dataset), max_frames or len(dataset)), desc="check", unit="frame") as bar:
-        return check_dataset(dataset, max_frames, lambda _: bar.update())
+    with Bar(total=min(len(dataset), args.max_frames), desc="check", unit="frame") as bar:
+        return check_dataset(dataset, args.max_frames, lambda _: bar.update())

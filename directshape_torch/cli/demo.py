@@ -24,9 +24,8 @@ from directshape_torch.evaluation.tables import align
 from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.stereo_dataset import StereoDataset, open_dataset
-from directshape_torch.visualize.frame_source import ExportOptions, FrameSource
 from directshape_torch.visualize.overlay import overlay_of_frame
-from directshape_torch.visualize.run_frames import RunInputs
+from directshape_torch.visualize.run_frames import RunFrame, RunInputs
 from directshape_torch.visualize.surface_files import frame_glb
 
 DEMO_FOLDER = Path(__file__).parent.parent / "assets" / "demo"
@@ -63,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
             dataset, refiner, args.out, RefineOptions(draw=overlay_of_frame), progress, fresh=args.fresh
         )
         (frame_id,) = dataset.frame_ids
-        frame = FrameSource(RunInputs(RunFolder(args.out), refiner.prior, dataset), frame_id, ExportOptions())
+        frame = RunFrame(RunInputs(RunFolder(args.out), refiner.prior, dataset), frame_id)
         write_bytes(args.out / "scene.glb", frame_glb(frame))
     print(error_table(frame))
     print(format_summary(summary))
@@ -72,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     return summary.exit_code
 
 
-def error_table(frame: FrameSource) -> str:
+def error_table(frame: RunFrame) -> str:
     """A table of centre, heading and bird's-eye IoU of each car against its label, before and after."""
     before, after = frame.with_images.detected_objects, frame.result.cars
     found = match_to_labels(before, frame.labels or [])

@@ -1,7 +1,7 @@
 """`directshape inspect`: figures of single cars.
 
-Refine the cars of a frame and draw the course of each: sampled pixels, residuals, contour, box and costs of each
-iteration, and its drift in a refinement by silhouettes only. docs/outputs.md shows the pictures.
+Refine the cars of a frame and draw the course of each: sampled pixels, residuals, and contour, box and costs of each
+iteration. docs/outputs.md shows the pictures.
 """
 
 from __future__ import annotations
@@ -11,35 +11,24 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from directshape_torch.cli.demo import demo_dataset
-from directshape_torch.cli.options import add_data_options, add_refiner_options, dataset_of, frame_id_of, make_refiner
+from directshape_torch.cli.options import add_data_options, add_refiner_options, dataset_of, make_refiner
 from directshape_torch.cli.progress import Bar
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.matching import match_to_labels
 from directshape_torch.files.atomic_files import check_folder, write_png
-from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.kitti_labels import box_corners_cam
-from directshape_torch.io.result_files import track_name
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.rig_file import known_rigs
 from directshape_torch.rig.rigs import RigEstimates
-from directshape_torch.visualize.car_figures import (
-    CarCourse,
-    drift_figure,
-    iteration_frames,
-    residual_figure,
-    sampling_figure,
-)
-from directshape_torch.visualize.drawing import Picture, View, draw_box, draw_contour, titled, write_gif
-from directshape_torch.visualize.drawn_car import DrawnCar, drawn_cars
+from directshape_torch.visualize.car_figures import CarCourse, iteration_frames, residual_figure, sampling_figure
+from directshape_torch.visualize.drawing import Picture, write_gif
 from directshape_torch.visualize.overlay import overlay_of_frame
-from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement, without_depth
+from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
 
-_SIZE_PX = (480, 334)
 _SECONDS_A_FRAME, _SECONDS_AT_END = 0.4, 2.5
 _FIGURES: dict[str, Callable[[CarCourse], Picture]] = {
     "sampling.png": sampling_figure,
@@ -48,13 +37,11 @@ _FIGURES: dict[str, Callable[[CarCourse], Picture]] = {
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of frame and car, or frames and their tracks, and settings."""
+    """Add the options of frames, car and settings."""
     data = parser.add_argument_group("input")
     data.add_argument("--demo", action="store_true", help="the bundled frame, without data")
-    data.add_argument("--frame", metavar="ID", type=frame_id_of, help="the frame; --frames for several")
     data.add_argument("--car", metavar="N", type=int, help="number of its line in the detection file; default: all")
     add_data_options(data, required=False)
-    data.add_argument("--tracks", action="store_true", help="refine --frames together and let each car move")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets a folder of figures a car")
     add_refiner_options(parser.add_argument_group("settings"))
 
@@ -66,32 +53,22 @@ def run(args: argparse.Namespace) -> int:
     # Pictures need no graphics card.
     refiner = make_refiner(args.config, args.set, args.prior, "cpu")
     refiner.rig = RigEstimates(known_rigs(args.rig))
-    if args.tracks:
-        if not inspect_tracks([dataset.load(frame_id) for frame_id in dataset.frame_ids], refiner, args.out):
-            raise InputError("--tracks", "a car in several of these frames", "none", "give more --frames")
-    else:
-        for frame_id in dataset.frame_ids:
-            loaded = dataset.load(frame_id)
-            inspect_frame(loaded, refiner, _rows(loaded, args.car), args.out, must_refine=args.car is not None)
+    for frame_id in dataset.frame_ids:
+        loaded = dataset.load(frame_id)
+        inspect_frame(loaded, refiner, _rows(loaded, args.car), args.out, must_refine=args.car is not None)
     print(f"figures  {args.out}")
     return 0
 
 
 def _dataset(args: argparse.Namespace) -> StereoDataset:
-    if args.tracks and args.car is not None:
-        raise InputError("--tracks", "all cars of several frames", f"--car {args.car} too", "leave one of them out")
     if args.demo:
-        if args.tracks:
-            raise InputError("--tracks", "frames of a sequence", "--demo, one frame", "give --data with --frames")
         if args.data is not None:
             raise InputError("--demo", "the bundled frame alone", f"--data {args.data} too", "leave one of them out")
-        return demo_dataset(None if args.frame is None else [args.frame])
+        return demo_dataset(args.frames)
     if args.data is None:
-        raise InputError("inspect", "something to inspect", "no frame", "give --data with --frame, or --demo")
-    if args.frame is not None:
-        args.frames = [args.frame]
+        raise InputError("inspect", "something to inspect", "no frame", "give --data with --frames, or --demo")
     if args.frames is None:
-        raise InputError("--frame", "the frame to inspect", "none", "give --frame ID, or several with --frames")
+        raise InputError("--frames", "the frames to inspect", "none", "give --frames ID, one or several")
     return dataset_of(args)
 
 
@@ -122,24 +99,12 @@ def inspect_frame(
     _report(loaded, trace, rows, must_refine)
     write_png(out_dir / f"{loaded.frame_id}.png", overlay_of_frame(loaded, trace.result))
     drawn = [row for row in rows if trace.place_of(row) >= 0]
-    silhouettes = silhouette_trace(refiner, loaded) if drawn else None
     truth = true_corners_cam(loaded)
     for row in Bar(drawn, unit="car", desc=f"frame {loaded.frame_id}"):
         folder, car = out_dir / f"{loaded.frame_id}_{line_of(loaded, row)}", CarCourse(loaded, trace, row, truth[row])
         for name, figure in _FIGURES.items():
             write_png(folder / name, figure(car))
         write_gif(folder / "iterations.gif", iteration_frames(car), _SECONDS_A_FRAME, _SECONDS_AT_END)
-        if silhouettes is not None and silhouettes.place_of(row) >= 0:
-            drift = drift_figure(car, CarCourse(loaded, silhouettes, row, truth[row]))
-            write_png(folder / "drift.png", drift)
-
-
-def silhouette_trace(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> RefinementTrace | None:
-    """The trace of a refinement by silhouettes and priors, or None if the refiner lacks one of the paper's terms."""
-    config = refiner.config
-    if not (config.photometric.weight > 0 and config.silhouette.weight > 0):
-        return None
-    return trace_refinement(without_depth(refiner), loaded.frame, loaded.detections)
 
 
 def _report(loaded: LoadedFrame, trace: RefinementTrace, rows: Sequence[int], must_refine: bool) -> None:
@@ -169,33 +134,3 @@ def true_corners_cam(loaded: LoadedFrame) -> list[NDArray[np.float64] | None]:
     corners = box_corners_cam(list(found.values()), loaded.frame.camera.t_cam_ref[0]).numpy()
     true = dict(zip(found, corners, strict=True))
     return [true.get(row) for row in range(len(loaded.detected_objects))]
-
-
-def inspect_tracks(loaded: Sequence[LoadedFrame], refiner: DirectShapeRefiner, out_dir: Path) -> list[Path]:
-    """Refine frames in one call, on the CPU, and write `track_NAME.gif` for each car that several of them show."""
-    with torch.no_grad():
-        result = refiner(*collate(loaded))
-    pictures: dict[str, list[Picture]] = {}
-    first_row = 0
-    for item in loaded:
-        ids, part = item.detections.track_id, result[first_row : first_row + len(item.detections)]
-        cars = drawn_cars(item.detections, part, [one.line_number for one in item.detected_objects])[1]
-        for car, number in zip(cars, [] if ids is None else ids.tolist(), strict=True):
-            pictures.setdefault(track_name(item.sequence or "", number), []).append(_picture(item, car))
-        first_row += len(item.detections)
-    paths = []
-    for name, frames in pictures.items():
-        if name and len(frames) > 1:
-            paths.append(out_dir / f"track_{name}.gif")
-            write_gif(paths[-1], frames, _SECONDS_A_FRAME, _SECONDS_A_FRAME)
-    return paths
-
-
-def _picture(item: LoadedFrame, car: DrawnCar) -> Picture:
-    """The part of the left image around a car, with its box and contour; all parts have one size."""
-    image = View.of_frame(item.frame)
-    view = image.around(car.corners_cam, _SIZE_PX) or View(np.zeros((*_SIZE_PX[::-1], 3), np.uint8), image.P)
-    draw_box(view, car.corners_cam, car.colour, car.is_front_known)
-    if car.surface is not None:
-        draw_contour(view, car.surface, car.colour)
-    return titled(view.picture, f"{item.frame_id}: {car.distance_m:.1f} m, {car.status}")

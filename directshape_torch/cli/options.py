@@ -23,7 +23,7 @@ from directshape_torch.io.run_manifest import hash_fields, hash_prior
 from directshape_torch.io.stereo_dataset import GroundSource, LayoutName, StereoDataset, open_dataset
 from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.rig.rig_file import RIG_FILE, load_fields
+from directshape_torch.rig.rig_file import RIG_FILE, known_rigs, load_rigs
 from directshape_torch.shape.load_prior import BUNDLED_PRIORS, load_prior
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.visualize.run_frames import RunInputs
@@ -153,7 +153,7 @@ def dataset_of(args: argparse.Namespace) -> StereoDataset:
         classes=args.classes,
         ground=args.ground,
         camera_height_m=args.camera_height,
-        disparity_field=() if args.rig in ("auto", "none") else load_fields(args.rig),
+        disparity_field=[rig.field for rig in known_rigs(args.rig)],
         disparity_dir=getattr(args, "disparity", None),
         lidar_dir=getattr(args, "lidar", None),
         tracks=getattr(args, "tracks", False),
@@ -222,25 +222,24 @@ def add_run_inputs(group: argparse._ActionsContainer, needed_for: str) -> None:
 def dataset_of_run(args: argparse.Namespace, run: RunFolder) -> StereoDataset | None:
     """The chosen frames of a run; None without `--data`."""
     if args.data is None:
-        names = ("detections", "masks", "masks_left", "masks_right", "disparity", "rig")
-        given = [f"--{name.replace('_', '-')}" for name in names if getattr(args, name, None) not in (None, "none")]
+        names = ("detections", "masks", "masks_left", "masks_right", "rig")
+        given = [f"--{name.replace('_', '-')}" for name in names if getattr(args, name) not in (None, "none")]
         if given:
             raise InputError("--data", f"the data set of the run, because of {', '.join(given)}", "nothing")
         return None
+    masks = mask_source(args)
+    of_masks = run.manifest.config.get("boxes") == "masks" and masks is not None
     return open_dataset(
         args.layout,
         args.data,
         # The result files take the place of detections that are not given, unless the boxes were made of the masks.
-        run.path
-        if args.detections is None and args.layout != "folder" and not _is_of_masks(args, run)
-        else args.detections,
-        mask_source(args),
+        run.path if args.detections is None and args.layout != "folder" and not of_masks else args.detections,
+        masks,
         frames=run.frame_ids,
         classes=run.classes,
         ground=run.setting("ground"),
         camera_height_m=run.setting("camera_height_m"),
         disparity_field=_fields_of_run(args.rig, run),
-        disparity_dir=getattr(args, "disparity", None),
     )
 
 
@@ -251,19 +250,12 @@ def inputs_of_run(args: argparse.Namespace, run: RunFolder) -> RunInputs:
     return RunInputs(run, prior_of_run(args.prior, run), dataset, has_detections)
 
 
-def _is_of_masks(args: argparse.Namespace, run: RunFolder) -> bool:
-    """Whether the run's boxes were made of masks, which are given."""
-    return run.manifest.config.get("boxes") == "masks" and mask_source(args) is not None
-
-
 def prior_of_run(source: str | None, run: RunFolder) -> ShapePrior | None:
-    """The named prior, which must be the run's, or the run's bundled prior; None if the run used another one."""
-    wanted = run.manifest.sha256["prior"]
-    priors = map(load_prior, BUNDLED_PRIORS if source is None else (source,))
-    found = next((prior for prior in priors if hash_prior(prior) == wanted), None)
-    if found is None and source is not None:
-        raise InputError("--prior", f"the prior of the run (sha256 {str(wanted)[:12]})", f"another one, {source}")
-    return found
+    """The named prior, or the run's bundled prior; None if the run used another one."""
+    if source is not None:
+        return load_prior(source)
+    bundled = map(load_prior, BUNDLED_PRIORS)
+    return next((prior for prior in bundled if hash_prior(prior) == run.manifest.sha256["prior"]), None)
 
 
 def _fields_of_run(rig: str, run: RunFolder) -> tuple[DisparityField, ...]:
@@ -273,7 +265,7 @@ def _fields_of_run(rig: str, run: RunFolder) -> tuple[DisparityField, ...]:
     if rig == "none" and (wanted is None or not own.is_file()):
         return ()
     path = own if rig == "none" else Path(rig)
-    fields = load_fields(path)
+    fields = tuple(estimate.field for estimate in load_rigs(path))
     if hash_fields(fields) != wanted:
         raise InputError("--rig", "the disparity fields that the run was made with", f"others in {path}")
     return fields

@@ -12,14 +12,13 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
 
 from directshape_torch.batch.group_refinement import limited_threads
 from directshape_torch.batch.learn_detector import learn_detector
-from directshape_torch.batch.options import MeshFormat, RefineOptions
+from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.ray_engine import check_cluster
 from directshape_torch.batch.refine_dataset import check_out_dir, refine_dataset
-from directshape_torch.batch.run_summary import format_summary
+from directshape_torch.batch.run_summary import RunSummary, format_summary
 from directshape_torch.check.check_dataset import check_frames
 from directshape_torch.check.finding import SAID_BY_THE_RUN, by_severity
 from directshape_torch.cli.options import (
@@ -70,7 +69,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def _add_outputs(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets data, shapes, summary.json ..")
-    group.add_argument("--meshes", choices=get_args(MeshFormat), help="write the surface of each refined car")
     group.add_argument("--overlays", action="store_true", help="write a picture of each frame, before and after")
     group.add_argument(
         "--fresh", action="store_true", help="remove the results that runs have left in DIR, start again"
@@ -89,7 +87,6 @@ def _add_workers(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--workers", type=int, metavar="N", help="processes side by side; default: this one alone")
     group.add_argument(
         "--threads",
-        "--threads-per-worker",
         type=int,
         default=1,
         metavar="N",
@@ -102,21 +99,11 @@ def _add_workers(group: argparse._ArgumentGroup) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Refine the data set, write the results and report."""
-    default_frames = _TRACK_FRAMES if args.tracks else 1
-    batch_frames = default_frames if args.batch_frames is None else args.batch_frames
-    draw = overlay_of_frame if args.overlays else None
-    options = RefineOptions(args.meshes, draw, batch_frames, args.workers, args.threads, args.ray)
-    extra = [] if args.lidar is None else [LidarPoints()]
     exact = ["rig.disparity_sigma_px=0"] if args.rig == "none" else []
-    settings = [*exact, *args.set]
+    settings, extra = [*exact, *args.set], [] if args.lidar is None else [LidarPoints()]
     # The data set is checked below, so the calls need no check.
     refiner = make_refiner(args.config, [*settings, "check=off"], args.prior, args.device, extra)
-    if options.ray is not None:
-        check_cluster(options.ray, refiner.prior.origin.device)
-    if args.disparity is not None and not refiner.config.fits_points:
-        raise InputError(
-            "--disparity", "settings that fit points", "point_cloud.weight 0", "add --config geometric or combined"
-        )
+    options = _options(args, refiner)
     dataset = dataset_of(args)
     check_out_dir(dataset, args.out)
     if load_config(args.config, settings).check != "off":
@@ -132,19 +119,37 @@ def run(args: argparse.Namespace) -> int:
                 _learn(dataset, refiner, refiner.rig)
     with _Progress(args.out, rigs if are_new else None) as progress:
         summary = refine_dataset(dataset, refiner, args.out, options, progress, fresh=args.fresh)
+    _print(args, summary, rigs, refiner.config.rig.disparity_sigma_px)
+    return summary.exit_code
+
+
+def _options(args: argparse.Namespace, refiner: DirectShapeRefiner) -> RefineOptions:
+    """The outputs and processes of the run; what cannot work is refused before the data are read."""
+    default_frames = _TRACK_FRAMES if args.tracks else 1
+    batch_frames = default_frames if args.batch_frames is None else args.batch_frames
+    draw = overlay_of_frame if args.overlays else None
+    options = RefineOptions(draw, batch_frames, args.workers, args.threads, args.ray)
+    if options.ray is not None:
+        check_cluster(options.ray, refiner.prior.origin.device)
+    if args.disparity is not None and not refiner.config.fits_points:
+        cure = "add --config geometric or combined"
+        raise InputError("--disparity", "settings that fit points", "point_cloud.weight 0", cure)
+    return options
+
+
+def _print(args: argparse.Namespace, summary: RunSummary, rigs: list[RigEstimate], sigma_px: float) -> None:
+    """Print warnings, the summary and the verdict; `sigma_px` is the unknown error of the disparities."""
     for warning in summary.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     print(format_summary(summary))
     # The report of this run uses only the rigs in the folder, and must say the same.
     sentences = verdict(summary.frames, rigs if args.rig == "auto" else [])
-    if args.rig == "none" and refiner.config.rig.disparity_sigma_px == 0:
-        sentences.append(
-            "cameras are taken to be exact (--rig none): where they are not, more boxes are worse than that"
-        )
+    if args.rig == "none" and sigma_px == 0:
+        exact = "cameras are taken to be exact (--rig none): where they are not, more boxes are worse than that"
+        sentences.append(exact)
     for sentence in sentences:
         print(f"verdict  {sentence}")
     print(f"results  {args.out}")
-    return summary.exit_code
 
 
 def _warn_of(dataset: StereoDataset) -> None:

@@ -47,7 +47,7 @@ def match_to_labels(detections: Sequence[KittiObject], labels: Sequence[KittiObj
     """
     known = [label for label in labels if label.has_box_3d]
     boxes = own_boxes_2d(detections)
-    overlap = box_iou(boxes, _image_boxes(known))
+    overlap = box_iou(boxes, np.array([label.box_2d for label in known], dtype=np.float64).reshape(-1, 4))
     touches = (overlap > 0).any(axis=1, keepdims=True)
     reach_m = np.where((boxes[:, 2:] > boxes[:, :2]).all(axis=1), _CERTAIN_REACH_M, _REACH_M)
     # 2D IoUs get values above all closenesses, so that they come first.
@@ -73,10 +73,6 @@ def _closeness(
     places = [np.array([o.location_ref for o in some]).reshape(-1, 3)[:, [0, 2]] for some in (detections, labels)]
     distance = np.linalg.norm(places[0][:, None] - places[1][None], axis=-1)
     return np.asarray((1 - (1 - _MINIMUM_IOU_2D) * distance / reach_m[:, None]).clip(0))
-
-
-def _image_boxes(objects: Sequence[KittiObject]) -> NDArray[np.float64]:
-    return np.array([o.box_2d for o in objects], dtype=np.float64).reshape(-1, 4)
 
 
 def files_of_frames(folder: Path) -> dict[str, Path]:

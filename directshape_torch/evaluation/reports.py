@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from directshape_torch.evaluation import comparison, evaluate_shapes
 from directshape_torch.evaluation.bootstrap import MetricSummary
@@ -20,7 +17,7 @@ from directshape_torch.evaluation.kitti_rules import DIFFICULTIES, NUM_RECALL_PO
 from directshape_torch.evaluation.pose_error import PoseErrors
 from directshape_torch.evaluation.shape_error import TAUS_M
 from directshape_torch.evaluation.tables import align, number, with_interval, write_csv
-from directshape_torch.files.atomic_files import write_json
+from directshape_torch.files.atomic_files import json_values, write_json
 from directshape_torch.refinement.trust import WORSE_BY
 
 _GROUP_METRICS = ("bev_iou_mean", "iou_3d_mean", "bev_iou_good_share", "centre_m_median", "yaw_deg_median")
@@ -162,20 +159,7 @@ def _text(heading: Sequence[str], *tables: str) -> str:
 
 def write_scores(path: Path | str, scores: Comparison | KittiScores | ShapeScores) -> None:
     """Write all figures except those of single cars as JSON (schema 1); estimates have value, low and high."""
-    content = {f.name: _plain(getattr(scores, f.name)) for f in fields(scores) if f.name != "cars"}
+    content = {f.name: json_values(getattr(scores, f.name)) for f in fields(scores) if f.name != "cars"}
     for score in content.get("scores", ()):
         score |= score.pop("curve")
     write_json(path, {"schema_version": 1} | content)
-
-
-def _plain(value: Any) -> Any:
-    """Nested dataclasses, tuples and arrays as JSON values: objects, lists, and null for values that are not finite."""
-    if is_dataclass(value):
-        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, dict):
-        return {name: _plain(part) for name, part in value.items()}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, (tuple, list)):
-        return [_plain(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,9 +1,8 @@
-"""This module reads and writes npz and npy files of numpy; sizes are checked first and nothing is unpickled."""
+"""This module reads and writes npz files of numpy; sizes are checked first and nothing is unpickled."""
 
 from __future__ import annotations
 
 import io
-import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -74,24 +73,3 @@ def _check_entries(content: io.BytesIO) -> None:
     for entry in entries:
         if entry.flag_bits & _ENCRYPTED or entry.compress_type not in _COMPRESSIONS:
             raise ValueError(f"{entry.filename} is encrypted or not compressed by deflation")
-
-
-def read_npy(path: Path | str) -> NDArray[Any]:
-    """The array of an npy file, read-only.
-
-    Raises:
-        DataFormatError: the file is missing, damaged, not an npy, larger than 512 MiB, or has Python objects.
-    """
-    cure = "save it with numpy.save"
-    content = read_bytes(path, cure=cure)
-    stream = io.BytesIO(content)
-    try:
-        version = np.lib.format.read_magic(stream)
-        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, is_fortran, dtype = header(stream)
-        # The shape of the header is checked against the existing bytes, so nothing is allocated for it.
-        array = np.frombuffer(content, dtype, math.prod(shape), stream.tell())
-        return array.reshape(shape, order="F" if is_fortran else "C")
-    # A manipulated header can raise any error in numpy.
-    except Exception as error:
-        raise DataFormatError(path, f"is no readable npy file ({error})", cure=cure) from error

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -87,6 +89,24 @@ def write_json(path: Path | str, value: Any, durable: bool = False) -> None:
     """Write `value` as JSON with sorted keys and a final newline; NaN and infinity raise, since JSON has none."""
     text = json.dumps(value, indent=2, sort_keys=True, allow_nan=False) + "\n"
     write_bytes(path, text.encode("utf-8"), durable)
+
+
+def json_values(value: Any) -> Any:
+    """Nested dataclasses, mappings, sequences and arrays as JSON values, with None for numbers that are not finite.
+
+    Examples:
+        >>> json_values({"sigmas": np.array([0.5, np.inf]), "line": (1, "Car")})
+        {'sigmas': [0.5, None], 'line': [1, 'Car']}
+    """
+    if is_dataclass(value):
+        return {field.name: json_values(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, dict):
+        return {name: json_values(part) for name, part in value.items()}
+    if isinstance(value, (np.ndarray, np.generic)):
+        return json_values(value.tolist())
+    if isinstance(value, (tuple, list)):
+        return [json_values(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_png(path: Path | str, image: NDArray[Any]) -> None:

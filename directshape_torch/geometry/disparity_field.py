@@ -9,7 +9,6 @@ texture a row offset that is ignored looks like disparity.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -95,7 +94,6 @@ class DisparityField:
         size_wh: width and height of the rig's images.
         K_left, K_right: (3, 3) intrinsics of the rig, pixels.
         T_right_cam: (4, 4) left to right camera, metres.
-        provenance: where the field came from and how well it fitted; kept in the file, not used.
         covariance: (10, 10) covariance of the coefficients, pixels^2; 0 where they are known exactly.
     """
 
@@ -105,7 +103,6 @@ class DisparityField:
     K_left: Tensor
     K_right: Tensor
     T_right_cam: Tensor
-    provenance: Mapping[str, str | int | float] = field(default_factory=dict)
     vertical_coefficients: Tensor = field(default_factory=lambda: torch.zeros(NUM_COEFFICIENTS))
     covariance: Tensor = field(default_factory=lambda: torch.zeros(NUM_COEFFICIENTS, NUM_COEFFICIENTS))
 

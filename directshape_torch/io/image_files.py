@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,7 @@ from directshape_torch.errors import DataFormatError
 from directshape_torch.files.find_files import found
 from directshape_torch.files.read_files import read_bytes
 
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_JPEG_SIGNATURE = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
-_PNG_HEADER_BYTES = 33
-# These are the markers of a start of frame; the excluded markers among them are tables.
-_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_JPEG_WITHOUT_LENGTH = frozenset((0x01, *range(0xD0, 0xD8)))
 # This is eight times the size of an 8-megapixel image.
 _MOST_PIXELS = 2**26
 _CURE = "copy or download the file again"
@@ -120,7 +113,7 @@ def _decode(path: Path | str, flags: int) -> NDArray[Any]:
     import cv2
 
     content = read_bytes(path)
-    _check_complete(path, content)
+    _check_whole(path, content)
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error as error:
@@ -130,53 +123,20 @@ def _decode(path: Path | str, flags: int) -> NDArray[Any]:
     return image
 
 
-def _check_complete(path: Path | str, content: bytes) -> None:
-    if content.startswith(_PNG_SIGNATURE):
-        _check_png(path, content)
-    elif content.startswith(_JPEG_SIGNATURE):
-        if _JPEG_END not in content[-64:]:
-            raise DataFormatError(path, f"JPEG is cut short after {len(content)} bytes", cure=_CURE)
-        _check_pixels(path, *_jpeg_size(content))
-    else:
-        raise DataFormatError(path, f"neither PNG nor JPEG, begins with {content[:8]!r}", cure=_CURE)
+def _check_whole(path: Path | str, content: bytes) -> None:
+    """Refuse what is damaged or cut short, and more pixels than allowed before memory is allocated for them."""
+    from PIL import Image, UnidentifiedImageError
 
-
-def _check_png(path: Path | str, content: bytes) -> None:
-    """Check every chunk (length, type, data, checksum), from the first with the image size to the last, IEND."""
-    if content[12:16] == b"IHDR" and len(content) >= _PNG_HEADER_BYTES:
-        _check_pixels(path, *struct.unpack_from(">II", content, 16))
-    position = len(_PNG_SIGNATURE)
-    while position + 12 <= len(content):
-        (length,) = struct.unpack_from(">I", content, position)
-        kind = content[position + 4 : position + 8]
-        end = position + 12 + length
-        if end > len(content):
-            break
-        (checksum,) = struct.unpack_from(">I", content, end - 4)
-        if zlib.crc32(content[position + 4 : end - 4]) != checksum:
-            raise DataFormatError(path, f"PNG is damaged: wrong checksum in chunk {kind!r}", cure=_CURE)
-        if kind == b"IEND":
-            return
-        position = end
-    raise DataFormatError(path, f"PNG is cut short after {len(content)} bytes", cure=_CURE)
-
-
-def _jpeg_size(content: bytes) -> tuple[int, int]:
-    """Width and height from the first frame header, or (0, 0) if there is none."""
-    position = len(_JPEG_SIGNATURE)
-    while position + 9 <= len(content) and content[position] == 0xFF:
-        marker = content[position + 1]
-        if marker == 0xFF or marker in _JPEG_WITHOUT_LENGTH:
-            position += 1 if marker == 0xFF else 2
-            continue
-        length, height, width = struct.unpack_from(">HxHH", content, position + 2)
-        if marker in _JPEG_FRAMES:
-            return width, height
-        position += 2 + length
-    return 0, 0
-
-
-def _check_pixels(path: Path | str, width: int, height: int) -> None:
-    """Refuse an image of more pixels than allowed, before memory is allocated for it."""
+    try:
+        with Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as image:
+            (width, height), is_png = image.size, image.format == "PNG"
+            image.verify()  # the checksums of a PNG
+    except UnidentifiedImageError as error:
+        raise DataFormatError(path, f"is no whole PNG or JPEG, begins with {content[:8]!r}", cure=_CURE) from error
+    # A damaged file can raise any error while it is parsed.
+    except Exception as error:
+        raise DataFormatError(path, f"cannot be read as a whole image ({error})", cure=_CURE) from error
+    if not is_png and _JPEG_END not in content[-64:]:
+        raise DataFormatError(path, f"JPEG is cut short after {len(content)} bytes", cure=_CURE)
     if not 0 < width * height <= _MOST_PIXELS:
         raise DataFormatError(path, f"states {width} x {height} pixels, expected 1 to {_MOST_PIXELS}", cure=_CURE)

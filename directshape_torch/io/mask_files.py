@@ -29,9 +29,9 @@ from directshape_torch.io.instance_masks import (
 from directshape_torch.io.kitti_labels import frame_number
 from directshape_torch.scene.frames import SIDES, Side
 
-COCO_CAR_IDS = frozenset({3})
+_COCO_CAR_ID = 3
 # KITTI MOTS numbers its classes 1 car, 2 pedestrian, 10 ignore; Cityscapes numbers from 24 on, with 26 for car.
-PNG_CAR_IDS = frozenset({1, 26})
+_PNG_CAR_IDS = frozenset({1, 26})
 _MOTS_IGNORE_CLASS = 10
 _IDS_PER_CLASS = 1000
 # The instance files of KITTI's semantic benchmark have Cityscapes' classes, of which 24 to 33 have instances.
@@ -53,12 +53,11 @@ class FrameJsonMasks:
     """
 
     directory: Path  # the folder, or the one above a folder `data`
-    car_ids: frozenset[int] = COCO_CAR_IDS  # category ids that are cars
 
     def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
         path = self.path(frame_id)
         entries = list(enumerate(read_coco_list(path)))
-        return within_memory(path, _from_coco(path, entries, size_hw, self.car_ids))
+        return within_memory(path, _from_coco(path, entries, size_hw))
 
     def files(self, frame_id: str) -> tuple[Path, ...]:
         path = self.path(frame_id)
@@ -91,7 +90,6 @@ class InstancePngMasks:
     """
 
     directory: Path  # the folder above both, or above the left one only
-    car_ids: frozenset[int] = PNG_CAR_IDS  # classes that are cars
     # Names of the two folders. Instances in `instance_02` and `instance_03`, the folders of tracking sequences, are
     # tracks.
     folders: tuple[str, str] = ("instance_2", "instance_3")
@@ -117,20 +115,20 @@ class InstancePngMasks:
         if ids.dtype == np.uint8 and values[-1]:
             problem = f"has 8 bits and numbers up to {values[-1]}, where class * 1000 + instance does not fit"
             raise DataFormatError(path, problem, cure="write 16 bits: 1000 * class + instance, car 1 or 26")
-        per_class = _ids_per_class(values, self.car_ids | _KNOWN_CLASSES)
+        per_class = _ids_per_class(values)
         for value in values:
             category, number = divmod(value, per_class)
             is_stuff = per_class == _IDS_PER_SEMANTIC_CLASS and (category < _FIRST_THING or not number)
             if is_stuff or category in (0, _MOTS_IGNORE_CLASS):
                 continue
             track = number if self.folders == _TRACKING_FOLDERS else -1
-            yield InstanceMask.found(side, value, category in self.car_ids, ids == value, track_id=track)
+            yield InstanceMask.found(side, value, category in _PNG_CAR_IDS, ids == value, track_id=track)
 
 
-def _ids_per_class(values: Sequence[int], classes: frozenset[int]) -> int:
+def _ids_per_class(values: Sequence[int]) -> int:
     """The factor of the class in instance numbers: 1000, or 256 if only that fits the classes."""
     plain, semantic = ([divmod(value, base) for value in values] for base in (_IDS_PER_CLASS, _IDS_PER_SEMANTIC_CLASS))
-    known = all(category in classes and number < _MOST_INSTANCES for category, number in plain)
+    known = all(category in _KNOWN_CLASSES and number < _MOST_INSTANCES for category, number in plain)
     fits = all(category <= _HIGHEST_CLASS for category, _ in semantic)
     has_things = any(category >= _FIRST_THING and number for category, number in semantic)
     is_stuff = not any(number for _, number in semantic)
@@ -146,7 +144,6 @@ class MotsTextMasks:
     """
 
     path: Path
-    car_ids: frozenset[int] = PNG_CAR_IDS  # classes that are cars
 
     def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
         lines = _mots_by_frame(self.path).get(frame_number(frame_id), [])
@@ -161,7 +158,7 @@ class MotsTextMasks:
             return None
         segmentation = {"size": [int(height), int(width)], "counts": counts}
         inside = decode_segmentation(self.path, f"line {line.number}", segmentation, size_hw)
-        is_car, track = int(category) in self.car_ids, int(number) % _IDS_PER_CLASS
+        is_car, track = int(category) in _PNG_CAR_IDS, int(number) % _IDS_PER_CLASS
         return InstanceMask.found("left", int(number), is_car, inside, track_id=track)
 
 
@@ -185,7 +182,6 @@ class CocoFileMasks:
     # The files; either may be None.
     left: Path | None
     right: Path | None
-    car_ids: frozenset[int] = COCO_CAR_IDS  # category ids that are cars
 
     def __post_init__(self) -> None:
         if self.left is None and self.right is None:
@@ -199,7 +195,7 @@ class CocoFileMasks:
         for side, path in zip(SIDES, (self.left, self.right), strict=True):
             if path is not None:
                 entries = _coco_by_frame(path).get(int(frame_id), [])
-                masks += within_memory(path, _from_coco(path, entries, size_hw, self.car_ids, side))
+                masks += within_memory(path, _from_coco(path, entries, size_hw, side))
         return masks
 
     def files(self, frame_id: str) -> tuple[Path, ...]:  # the same two files serve all frames
@@ -315,7 +311,6 @@ def _from_coco(
     path: Path,
     entries: Sequence[_Entry],
     size_hw: tuple[int, int],
-    car_ids: frozenset[int],
     of_side: Side | None = None,  # None: each entry names its side
 ) -> Iterator[InstanceMask | None]:
     for index, entry in entries:
@@ -334,7 +329,7 @@ def _from_coco(
             else decode_segmentation(path, where, entry.get("segmentation"), size_hw)
         )
         try:
-            number, is_car = int(entry.get("instance_id", index)), int(entry["category_id"]) in car_ids
+            number, is_car = int(entry.get("instance_id", index)), int(entry["category_id"]) == _COCO_CAR_ID
             mask = InstanceMask.found(side, number, is_car, probability, score=_score(entry))
         except (KeyError, TypeError, ValueError) as error:
             raise DataFormatError(path, f"entry {index}: bad or missing field ({error!r})") from error

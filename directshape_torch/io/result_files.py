@@ -1,12 +1,12 @@
-"""This module reads and writes KITTI result files, states and shapes of frames (schema 5), and tracks."""
+"""This module writes KITTI result files, and reads and writes states and shapes of frames (schema 5)."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +18,9 @@ from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.status import Status
 
 SHAPES_SCHEMA_VERSION = 5
-TRACK_SCHEMA_VERSION = 1
 _AGAIN = "refine the frame again"
 
 Floats = NDArray[np.floating[Any]]
-_Arrays = TypeVar("_Arrays")
 # The kinds of arrays in a file are keyed by the type of the field.
 _KINDS = {"str": "U", "tuple[str, ...]": "U", "Floats": "f", "NDArray[np.int64]": "i", "NDArray[np.bool_]": "b"}
 
@@ -67,7 +65,7 @@ def write_result_text(
 
 
 def shaped(*sizes: str | int) -> dict[str, tuple[str | int, ...]]:
-    """Metadata of a field for `check_shapes`: its sizes, with letters as in the description of the class."""
+    """Metadata of a field: its sizes, with letters as in the description of the class, which checks them."""
     return {"shape": sizes}
 
 
@@ -129,62 +127,47 @@ class ShapeArrays:
     def __post_init__(self) -> None:
         last = {"B": self.input_lines.shape, "K": self.codes.shape, "P": self.profile_offsets_px.shape}
         sizes = {letter: shape[-1] if shape else 0 for letter, shape in last.items()}
-        check_shapes(self, {**sizes, "D": 6 + sizes["K"], "T": len(self.term_names)})
-
-
-def check_shapes(arrays: Any, sizes: Mapping[str, int]) -> None:
-    """Raise `InputError` unless the fields of a dataclass have the shapes that they declare by `shaped`."""
-    for entry in fields(arrays):
-        shape = tuple(sizes.get(str(size), size) for size in entry.metadata.get("shape", ()))
-        got = np.shape(getattr(arrays, entry.name))
-        if shape and got != shape:
-            raise InputError(entry.name, f"shape {shape}", f"{got}")
+        sizes |= {"D": 6 + sizes["K"], "T": len(self.term_names)}
+        for entry in fields(self):
+            shape = tuple(sizes.get(str(size), size) for size in entry.metadata.get("shape", ()))
+            got = np.shape(getattr(self, entry.name))
+            if shape and got != shape:
+                raise InputError(entry.name, f"shape {shape}", f"{got}")
 
 
 def write_shapes(path: Path | str, shapes: ShapeArrays) -> None:
     """Write the states and shapes of a frame with a checksum; equal content gives equal bytes, without pickle."""
-    write_arrays(path, shapes, SHAPES_SCHEMA_VERSION)
-
-
-def write_arrays(path: Path | str, content: Any, version: int) -> None:
-    """Write the fields of a dataclass (arrays and text) with a checksum, for `read_arrays`."""
-    arrays: dict[str, NDArray[Any]] = {"schema_version": np.array(version)}
-    for entry in fields(content):
-        value = getattr(content, entry.name)
-        arrays[entry.name] = np.array(value, dtype=np.str_) if isinstance(value, (str, tuple)) else np.asarray(value)
+    arrays: dict[str, NDArray[Any]] = {"schema_version": np.array(SHAPES_SCHEMA_VERSION)}
+    for name, value in vars(shapes).items():
+        arrays[name] = np.array(value, dtype=np.str_) if isinstance(value, (str, tuple)) else np.asarray(value)
     write_npz(path, {**arrays, "sha256": np.array(_hash_arrays(arrays))})
 
 
 def read_shapes(path: Path | str) -> ShapeArrays:
     """Read a file of `write_shapes`."""
-    return read_arrays(path, ShapeArrays, SHAPES_SCHEMA_VERSION)
-
-
-def read_arrays(path: Path | str, kind: type[_Arrays], version_read: int) -> _Arrays:
-    """Read a file of `write_arrays` as the dataclass `kind`, whose `statuses` are names of `Status`."""
     arrays = read_npz(path, cure=_AGAIN)
     sha256 = arrays.pop("sha256", None)
     is_whole = sha256 is not None and sha256.tolist() == _hash_arrays(arrays)
     version = arrays.pop("schema_version", None)
-    if version is None or version.tolist() != version_read:
-        found = None if version is None else version.tolist()
-        raise DataFormatError(path, f"has shape schema {shown(found)}, this version reads {version_read}", cure=_AGAIN)
+    if version is None or version.tolist() != SHAPES_SCHEMA_VERSION:
+        found = shown(None if version is None else version.tolist())
+        problem = f"has shape schema {found}, this version reads {SHAPES_SCHEMA_VERSION}"
+        raise DataFormatError(path, problem, cure=_AGAIN)
     if not is_whole:
         raise DataFormatError(path, "has been changed since it was written", cure=_AGAIN)
-    kinds = {entry.name: _KINDS[str(entry.type)] for entry in fields(cast(Any, kind))}
+    kinds = {entry.name: _KINDS[str(entry.type)] for entry in fields(ShapeArrays)}
     if set(arrays) != set(kinds):
         raise DataFormatError(path, f"has the fields {sorted(arrays)}, expected {sorted(kinds)}", cure=_AGAIN)
     for name, letter in kinds.items():
         if arrays[name].dtype.kind != letter:
             raise DataFormatError(path, f"{name} holds {arrays[name].dtype}, expected kind {letter!r}", cure=_AGAIN)
-    statuses = set(arrays["statuses"].reshape(-1).tolist())
     try:
-        content = kind(**{name: _from_text(array) for name, array in arrays.items()})
+        shapes = ShapeArrays(**{name: _from_text(array) for name, array in arrays.items()})
     except InputError as error:
         raise DataFormatError(path, str(error), cure=_AGAIN) from error
-    if unknown := statuses - set(Status.__members__):
+    if unknown := set(shapes.statuses) - set(Status.__members__):
         raise DataFormatError(path, f"statuses hold {shown(min(unknown))}", cure=_AGAIN)
-    return content
+    return shapes
 
 
 def _hash_arrays(arrays: Mapping[str, NDArray[Any]]) -> str:
@@ -208,38 +191,6 @@ def _decimal(number: float) -> str:
     return f"{round(float(number), 4) + 0.0:.4f}"
 
 
-@dataclass(frozen=True)
-class TrackArrays:
-    """A `TrackArrays` is a car in F frames; K codes, D = 6 + K; views equal entries of the frames' `ShapeArrays`."""
-
-    track: str
-    prior_sha256: str  # of the shape prior of the codes
-    # Code of the refined view with the smallest covariance; NaN if no view was refined.
-    code: Floats = field(metadata=shaped("K"))
-    code_covariance: Floats = field(metadata=shaped("K", "K"))  # covariance of the code
-    dimensions_hwl: Floats = field(metadata=shaped(3))  # of the shape of the code, metres
-    frame_ids: tuple[str, ...] = field(metadata=shaped("F"))  # in the order of the frames
-    input_lines: NDArray[np.int64] = field(metadata=shaped("F"))  # line numbers in the detection files, from 1
-    statuses: tuple[str, ...] = field(metadata=shaped("F"))  # names of `Status`
-    # 0 for views that share a shape, 1, 2 .. for later views that cannot show the same car, -1 for a view that shares
-    # no shape.
-    parts: NDArray[np.int64] = field(metadata=shaped("F"))
-    # Object to left camera, and object to the frame of the labels.
-    T_cam_obj: Floats = field(metadata=shaped("F", 4, 4))
-    T_ref_obj: Floats = field(metadata=shaped("F", 4, 4))
-    # The boxes of the result lines.
-    boxes_hwl: Floats = field(metadata=shaped("F", 3))
-    boxes_location_ref: Floats = field(metadata=shaped("F", 3))
-    boxes_rotation_y: Floats = field(metadata=shaped("F"))
-    # Equal in all views of a call, except that untrusted views keep their own code.
-    codes: Floats = field(metadata=shaped("F", "K"))
-    # In the tangent (v, omega, code) of the solver; NaN if there is none.
-    covariances: Floats = field(metadata=shaped("F", "D", "D"))
-
-    def __post_init__(self) -> None:
-        check_shapes(self, {"F": len(self.frame_ids), "K": self.codes.shape[-1], "D": 6 + self.codes.shape[-1]})
-
-
 def track_name(sequence: str, track_id: int) -> str:
     """The name of a track in file names, "" for a car without a track.
 
@@ -250,58 +201,3 @@ def track_name(sequence: str, track_id: int) -> str:
     if track_id < 0:
         return ""
     return f"{sequence}_{track_id:06d}" if sequence else f"{track_id:06d}"
-
-
-def track_path(out_dir: Path | str, track: str) -> Path:
-    """The file of a track."""
-    return Path(out_dir) / "tracks" / f"{track}.npz"
-
-
-def read_track(path: Path | str) -> TrackArrays:
-    """Read a file of `write_tracks`."""
-    return read_arrays(path, TrackArrays, TRACK_SCHEMA_VERSION)
-
-
-def write_tracks(out_dir: Path | str, frames: Iterable[ShapeArrays]) -> list[str]:
-    """Write a file for every track in the finished frames of a run, in the order of the frames.
-
-    Returns:
-        The tracks that were split.
-    """
-    views: dict[str, list[tuple[ShapeArrays, int]]] = {}
-    for shapes in frames:
-        for car, track in enumerate(shapes.tracks):
-            if track:
-                views.setdefault(track, []).append((shapes, car))
-    for track, cars in views.items():
-        write_arrays(track_path(out_dir, track), _track(track, cars), TRACK_SCHEMA_VERSION)
-    return [track for track, cars in views.items() if any(shapes.track_parts[car] > 0 for shapes, car in cars)]
-
-
-def _track(track: str, views: list[tuple[ShapeArrays, int]]) -> TrackArrays:
-    def stacked(name: str) -> Floats:
-        return np.stack([getattr(shapes, name)[car] for shapes, car in views])
-
-    statuses = tuple(shapes.statuses[car] for shapes, car in views)
-    codes, covariances, boxes_hwl = stacked("codes"), stacked("covariances"), stacked("boxes_hwl")
-    is_refined = np.array([Status[status].is_refined for status in statuses])
-    # Views that were not refined or have no finite covariance are not candidates.
-    variance = np.trace(covariances[:, 6:, 6:], axis1=1, axis2=2)
-    best = int(np.argmin(np.where(is_refined & np.isfinite(variance), variance, np.inf)))
-    unknown = 1.0 if is_refined.any() else np.nan
-    same = ("T_cam_obj", "T_ref_obj", "boxes_location_ref", "boxes_rotation_y")
-    return TrackArrays(
-        track=track,
-        prior_sha256=views[0][0].prior_sha256,
-        code=codes[best] * unknown,
-        code_covariance=covariances[best, 6:, 6:] * unknown,
-        dimensions_hwl=boxes_hwl[best] * unknown,
-        frame_ids=tuple(shapes.frame_id for shapes, _ in views),
-        input_lines=stacked("input_lines").astype(np.int64),
-        statuses=statuses,
-        parts=stacked("track_parts").astype(np.int64),
-        boxes_hwl=boxes_hwl,
-        codes=codes,
-        covariances=covariances,
-        **{name: stacked(name) for name in same},
-    )

@@ -33,7 +33,7 @@ _AGAIN = "refine the frame again"
 # An entry names cars whose probability to be not worse is below `_SURE`, at most `_MOST_DOUBTFUL` of a frame.
 _SURE, _MOST_DOUBTFUL = 0.95, 3
 # File names in a record must stay within the folder, since anybody may have written them.
-_FILE = re.compile(r"(data|shapes|meshes|overlays)/[^/\\]+")
+_FILE = re.compile(r"[a-z]+/[^/\\]+")
 
 
 def summary_path(out_dir: Path | str) -> Path:
@@ -61,11 +61,6 @@ def failure_path(out_dir: Path | str, frame_id: str) -> Path:
     return Path(out_dir) / "failed" / f"{frame_id}.txt"
 
 
-def mesh_path(out_dir: Path | str, frame_id: str, line_number: int, mesh_format: str) -> Path:
-    """The mesh file of one car; lines are counted from 1."""
-    return Path(out_dir) / "meshes" / f"{frame_id}_{line_number}.{mesh_format}"
-
-
 class FrameEntry(TypedDict, total=False):
     """A `FrameEntry` says how a frame ended: a failed frame has only `reason`, a frame that is done has the rest."""
 
@@ -90,25 +85,19 @@ class FrameRecord:
 
     run: str  # hash of the manifest
     inputs: Mapping[str, str]  # sha256 of the files of the data set, by their role
-    # Kinds of files that the frame has: "data", "shapes", "meshes_ply", "meshes_glb", "overlays".
-    outputs: Sequence[str]
+    outputs: Sequence[str]  # folders in which the frame has files: "data", "shapes", "overlays"
     files: Mapping[str, str]  # sha256 of each file but the one with this record, by path in the output folder
     lines: int  # number of lines in the detection file
     masks_right: int  # number of cars with a mask in the right image
 
     def files_of(self, outputs: Iterable[str]) -> dict[str, str]:
-        """The entries of `files` that belong to the given kinds of outputs."""
-        kinds = set(outputs)
-        return {name: sha256 for name, sha256 in self.files.items() if _kind(name) in kinds}
+        """The entries of `files` that lie in the given folders."""
+        folders = set(outputs)
+        return {name: sha256 for name, sha256 in self.files.items() if name.partition("/")[0] in folders}
 
     def text(self) -> str:
         """JSON text of the record for `ShapeArrays.made_of`."""
         return json.dumps(asdict(self), sort_keys=True)
-
-
-def _kind(name: str) -> str:
-    folder, _, file = name.partition("/")
-    return f"meshes_{file[-3:]}" if folder == "meshes" else folder
 
 
 def read_record(path: Path, shapes: ShapeArrays) -> FrameRecord:
@@ -124,7 +113,7 @@ def read_done(
 ) -> tuple[ShapeArrays, FrameRecord]:
     """The shapes and the record of a frame that is done.
 
-    Its files of the kinds `outputs` must exist with unchanged bytes, written by the run with the hash `run`.
+    Its files in the folders `outputs` must exist with unchanged bytes, written by the run with the hash `run`.
     """
     path = shapes_path(out_dir, frame_id)
     shapes = read_shapes(path)
@@ -196,7 +185,6 @@ class FrameResult:
     lines: tuple[KittiObject, ...]  # every line of the result file
     shapes: ShapeArrays  # states and shapes of the cars
     record: FrameRecord  # how the files were made
-    mesh_files: tuple[Path | None, ...] = ()  # the saved mesh of each car, or None
 
     @property
     def cars(self) -> list[KittiObject]:
@@ -253,12 +241,7 @@ class RunFolder:
         lines = tuple(read_objects(text))
         if not set(shapes.input_lines.tolist()) <= {line.line_number for line in lines}:
             raise DataFormatError(text, f"lacks lines of {shapes_path(self.path, frame_id)}", cure=_AGAIN)
-        names = record.files_of(("meshes_ply", "meshes_glb"))
-        # Files are named "meshes/NNNNNN_LINE.ply". The name of a frame may contain an underscore too.
-        saved = {Path(name).stem.rpartition("_")[2]: self.path / name for name in names}
-        meshes = (saved.get(str(line)) for line in shapes.input_lines.tolist())
-        whole = tuple(mesh if mesh is not None and mesh.is_file() else None for mesh in meshes)
-        return FrameResult(frame_id, lines, shapes, record, whole)
+        return FrameResult(frame_id, lines, shapes, record)
 
 
 def done_frames(out_dir: Path) -> list[str]:

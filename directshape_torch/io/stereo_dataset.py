@@ -360,11 +360,7 @@ class StereoDataset:
     def _ground(
         self, files: FrameFiles, left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera
     ) -> GroundPlane:
-        """The plane of the first source that has one, in the order that `self.ground` selects.
-
-        Plane files are commonly made from raw disparity and have its bias, so with a disparity field "auto" tries the
-        corrected stereo pair first.
-        """
+        """The plane of the first source that has one, in the order that `self.ground` selects."""
         orders: dict[GroundSource, tuple[GroundSource, ...]] = {
             "auto": ("file", "stereo") if not self.disparity_fields else ("stereo", "file"),
             "file": ("file",),

@@ -1,9 +1,8 @@
-"""This module reads LiDAR points from KITTI's scans (`velodyne/NNNNNN.bin`) and from arrays."""
+"""This module reads LiDAR points from KITTI's scans (`velodyne/NNNNNN.bin`)."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +10,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.files.array_files import read_npy
 from directshape_torch.files.read_files import read_bytes
 from directshape_torch.geometry.projection import project
 from directshape_torch.geometry.stereo_camera import StereoCamera
@@ -46,25 +44,23 @@ def lidar_pose(calibration: KittiCalibration) -> NDArray[np.float64]:
 
 
 def read_points(path: Path | str) -> NDArray[np.float64]:
-    """Points (P, 3), metres, in the frame of the file.
+    """Points (P, 3), metres, in the frame of the scanner.
 
-    KITTI's `.bin` is little-endian float32 with four numbers for each point: x, y, z, reflectance. `.npy` is an array
-    (P, 3 or more). Points whose coordinates are not finite are dropped, because the scanner measured nothing there.
+    The file is little-endian float32 with four numbers for each point: x, y, z, reflectance. Points whose coordinates
+    are not finite are dropped, because the scanner measured nothing there.
     """
     path = Path(path)
-    if path.suffix.lower() == ".npy":
-        points = read_npy(path)
-        if points.ndim != 2 or points.shape[1] < 3 or not len(points) or points.dtype.kind not in "fiu":
-            got = f"{points.dtype} of shape {points.shape}"
-            raise DataFormatError(path, f"expected one point or more as numbers (P, 3 or more), got {got}")
-        return _finite(path, points[:, :3])
     by_columns = points_by_columns(path)
     if NUM_COLUMNS not in by_columns:
         others = ", ".join(map(str, by_columns))
         problem = f"expected 16 bytes a point (x, y, z, reflectance), got {path.stat().st_size} bytes"
         cure = f"these are whole points of {others} numbers each (nuScenes writes 5): keep four" if others else ""
         raise DataFormatError(path, problem, cure=cure)
-    return _finite(path, by_columns[NUM_COLUMNS])
+    points = by_columns[NUM_COLUMNS].astype(np.float64)
+    finite: NDArray[np.float64] = points[np.isfinite(points).all(axis=1)]
+    if not len(finite):
+        raise DataFormatError(path, f"none of its {len(points)} points has finite coordinates")
+    return finite
 
 
 def points_by_columns(path: Path) -> dict[int, NDArray[np.float32]]:
@@ -72,14 +68,6 @@ def points_by_columns(path: Path) -> dict[int, NDArray[np.float32]]:
     content = read_bytes(path)
     counts = [count for count in _POSSIBLE_COLUMNS if content and not len(content) % (4 * count)]
     return {count: np.frombuffer(content, dtype="<f4").reshape(-1, count)[:, :3] for count in counts}
-
-
-def _finite(path: Path, points: NDArray[Any]) -> NDArray[np.float64]:
-    xyz: NDArray[np.float64] = points.astype(np.float64)
-    xyz = xyz[np.isfinite(xyz).all(axis=1)]
-    if not len(xyz):
-        raise DataFormatError(path, f"none of its {len(points)} points has finite coordinates")
-    return xyz
 
 
 def in_image(points_cam: Tensor, size_hw: tuple[int, int], camera: StereoCamera) -> Tensor:

@@ -273,7 +273,7 @@ class RigEstimate(nn.Module):
 
     def metres_per_pixel(self, depth_m: float) -> float:
         """Change in depth, in metres, of a point at `depth_m` for one pixel of disparity."""
-        return depth_m**2 / self._focal_baseline
+        return depth_m**2 / float(self._blank.K_left[0, 0] * -self._blank.T_right_cam[0, 3])
 
     def is_of(self, size_wh: tuple[int, int], K_left: Tensor, K_right: Tensor, T_right_cam: Tensor) -> bool:
         """Whether frames with this size and these matrices come from the rig."""
@@ -286,7 +286,10 @@ class RigEstimate(nn.Module):
     def content(self) -> dict[str, Any]:
         """All evidence of the estimate, for JSON; `of_content` reads it back."""
         size_wh, *matrices = (list(part) if isinstance(part, tuple) else part.tolist() for part in self._blank.rig)
-        pixels = {kind: {n: _plain(x) for n, x in sums._asdict().items()} for kind, sums in self.pixels.items()}
+        pixels = {
+            kind: {name: x.tolist() if isinstance(x, Tensor) else x for name, x in sums._asdict().items()}
+            for kind, sums in self.pixels.items()
+        }
         rig = dict(zip(("K_left", "K_right", "T_right_cam"), matrices, strict=True))
         seen = {name: getattr(self, name).tolist() for name in ("rows", "sizes", "results")}
         return {"size_wh": size_wh, **rig, **seen, "pixels": pixels}
@@ -297,15 +300,15 @@ class RigEstimate(nn.Module):
         try:
             width, height = (int(n) for n in content["size_wh"])
             sizes = {"K_left": 3, "K_right": 3, "T_right_cam": 4}
-            rig = cls((width, height), *(to_tensor(content, name, (n, n)) for name, n in sizes.items()))
-            rig.add_rows(to_tensor(content, "rows", (None, len(COLUMNS))))
+            rig = cls((width, height), *(_tensor_of(content, name, (n, n)) for name, n in sizes.items()))
+            rig.add_rows(_tensor_of(content, "rows", (None, len(COLUMNS))))
             # Files of earlier versions hold neither sizes nor results.
             content = {"sizes": [], "results": [], **content}
-            rig.add_sizes(to_tensor(content, "sizes", (None, len(COLUMNS))))
-            rig.add_results(to_tensor(content, "results", (None, detector_noise.NUM_COLUMNS)))
+            rig.add_sizes(_tensor_of(content, "sizes", (None, len(COLUMNS))))
+            rig.add_results(_tensor_of(content, "results", (None, detector_noise.NUM_COLUMNS)))
             for kind, sums in content["pixels"].items():
                 points, frames, *names = PixelEvidence._fields
-                tensors = (to_tensor(sums, name, shape) for name, shape in zip(names, _OF_PIXELS, strict=True))
+                tensors = (_tensor_of(sums, name, shape) for name, shape in zip(names, _OF_PIXELS, strict=True))
                 rig.add_pixels(kind, PixelEvidence(int(sums[points]), int(sums[frames]), *tensors))
         except DAMAGE as error:
             raise InputError("content", "that of an estimate", f"another ({error!r})") from error
@@ -324,10 +327,6 @@ class RigEstimate(nn.Module):
             raise InputError("state", "what get_extra_state has made", f"something else ({error})") from error
         self._blank, self.rows, self.pixels, self._solved = other._blank, other.rows, other.pixels, None
         self.sizes, self.results = other.sizes, other.results
-
-    @property
-    def _focal_baseline(self) -> float:
-        return float(self._blank.K_left[0, 0] * -self._blank.T_right_cam[0, 3])
 
     def _solve(self) -> tuple[Posterior, DisparityField]:
         if self._solved is None:
@@ -356,7 +355,7 @@ class RigEstimate(nn.Module):
         return hull(uv) if len(uv) else self._blank.hull_uv
 
 
-def to_tensor(entry: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) -> Tensor:
+def _tensor_of(entry: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) -> Tensor:
     """Numbers by name in the content of a JSON file, float64, else `ValueError`; None in `shape` is any size."""
     try:
         tensor = torch.tensor(entry[name], dtype=torch.float64)
@@ -383,7 +382,3 @@ def _kept_rows(rows: Tensor) -> Tensor:
     rows = rows.unique(dim=0)  # type: ignore[no-untyped-call]
     key = (rows[:, :4] * rows.new_tensor([0.754877, 0.569840, 0.430159, 0.324718])).sum(dim=1) % 1
     return rows[key.argsort()[:_MOST_ROWS]]
-
-
-def _plain(value: int | Tensor) -> Any:
-    return value.tolist() if isinstance(value, Tensor) else value

@@ -1,8 +1,7 @@
-"""This module draws figures of a car: sampled pixels, residuals, its iterations, and the drift without photometry."""
+"""This module draws figures of a car: sampled pixels, residuals, and its iterations."""
 
 from __future__ import annotations
 
-from bisect import bisect
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -96,13 +95,6 @@ class CarCourse:
         """Cost (N + 1,) of each term by its name, with the settings of the final stage, and their "sum"."""
         costs = self.trace.costs[:, self.row].cpu().numpy()
         return {**dict(zip(self.trace.result.term_names, costs.T, strict=True)), "sum": costs.sum(axis=1)}
-
-    @property
-    def distances(self) -> Array:
-        """Distance (N + 1,) on the ground from the true centre, or without truth from the input's centre, metres."""
-        true = self.cars[0].corners_cam if self.truth_corners_cam is None else self.truth_corners_cam
-        away = [np.linalg.norm((car.corners_cam - true).mean(axis=0)[[0, 2]]) for car in self.cars]
-        return np.array([away[bisect(self.steps, number) - 1] for number in range(len(self.trace))])
 
     def view(self, side: Side, size_wh: tuple[int, int] = _PANEL_PX) -> View:
         """The part of an image around the car; the disparity field is evaluated at the input pose of the car."""
@@ -209,25 +201,6 @@ def iteration_frames(car: CarCourse) -> list[Picture]:
         chart = curves(costs, "cost", (_PANEL_PX[1], above.shape[0]), number)
         frames.append(titled(beside([*images, above, chart]), f"{car.title}, iteration {number}", legend=_legend(car)))
     return frames
-
-
-def drift_figure(full: CarCourse, silhouettes: CarCourse) -> Picture:
-    """A car refined with all terms, compared with its refinement without photometry."""
-    rows = []
-    for name, car in (("silhouettes alone", silhouettes), ("all terms", full)):
-        inks, last = _step_inks(len(car.cars)), len(car.cars) - 1
-        # The first, an early and the last state are shown, because the car moves most in the first few steps.
-        places = (0, min(max(last // 4, 1), last), last)
-        images = [
-            titled(car.outlined("left", [(car.cars[place], inks[place])]), f"{name}: iteration {car.steps[place]}")
-            for place in places
-        ]
-        above = titled(car.from_above(len(car.cars)), f"{name}: seen from above")
-        rows.append(beside([above, *images]))
-    towards = "input" if full.truth_corners_cam is None else "true"
-    series = {"silhouettes alone": (silhouettes.distances, _RED), "all terms": (full.distances, BLUE)}
-    chart = curves(series, f"distance to the {towards} centre [m]", (_PANEL_PX[0], 2 * rows[0].shape[0]))
-    return titled(beside([beside(rows, below=True), chart]), full.title, legend=_legend(full))
 
 
 def _legend(car: CarCourse) -> dict[str, Colour]:

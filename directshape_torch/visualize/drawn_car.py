@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from directshape_torch.files.mesh_files import T_GLTF_CAM, read_mesh
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
-from directshape_torch.io.kitti_labels import KittiObject, box_corners_cam, poses_cam
+from directshape_torch.io.kitti_labels import KittiObject, box_corners_cam
 from directshape_torch.refinement.quality import is_front_known
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.scene.detections import Detections
@@ -109,20 +107,6 @@ def corners_cam(location_ref: Tensor, rotation_y: Tensor, hwl: Tensor, t_cam_ref
     return np.asarray(box_corners(pose_from_kitti(location_ref + t_cam_ref, rotation_y), hwl))
 
 
-def cars_before(
-    objects: Sequence[KittiObject],
-    t_cam_ref: Tensor,  # (3,)
-    mean: trimesh.Trimesh | None,
-    num_codes: int,
-) -> list[DrawnCar]:
-    """The mean shape at the pose of each detection, with the detection's box."""
-    T_cam_obj = poses_cam(objects, t_cam_ref.double().cpu()).numpy()
-    corners, code = box_corners_cam(objects, t_cam_ref.cpu()).numpy(), np.zeros(num_codes)
-    return [
-        DrawnCar(T, box, code, mean, one.line_number) for T, box, one in zip(T_cam_obj, corners, objects, strict=True)
-    ]
-
-
 def cars_after(
     lines: Sequence[int],
     statuses: Sequence[str],
@@ -132,23 +116,18 @@ def cars_after(
     fronts: Sequence[bool],  # whether the front of each car is known
     before: Sequence[DrawnCar] | None,
     prior: ShapePrior | None,
-    mesh_files: Sequence[Path | None] | None = None,
 ) -> list[DrawnCar]:
-    """The refined shapes, from the prior or else from saved meshes, with the boxes of the result.
+    """The refined shapes, if the prior is known, with the boxes of the result.
 
-    Cars that were not refined stay as in `before`, if it is given. A file that is not a readable mesh raises
-    `DataFormatError`.
+    Cars that were not refined stay as in `before`, if it is given.
     """
     cars = []
     for car, status in enumerate(statuses):
         if not is_refined(status) and before is not None:
             cars.append(replace(before[car], status=status))
             continue
-        T, code, mesh = T_cam_obj[car].astype(np.float64), codes[car].astype(np.float64), None
-        if prior is not None:
-            mesh = decoded_car(prior, code)
-        elif mesh_files is not None and (file := mesh_files[car]) is not None:
-            mesh = _saved_car(file, T)
+        T, code = T_cam_obj[car].astype(np.float64), codes[car].astype(np.float64)
+        mesh = None if prior is None else decoded_car(prior, code)
         cars.append(DrawnCar(T, corners[car], code, mesh, lines[car], status, fronts[car]))
     return cars
 
@@ -162,16 +141,6 @@ def decoded_car(prior: ShapePrior, code: Array) -> trimesh.Trimesh:
     """The shape of a code (K,) in its object frame."""
     codes = torch.from_numpy(np.asarray(code, dtype=np.float64))[None].to(prior.origin)
     return sdf_to_mesh(prior.values(codes)[0], prior.origin, prior.spacing_m)
-
-
-def _saved_car(path: Path, T_cam_obj: Array) -> trimesh.Trimesh:
-    """The shape of a saved mesh of a run, transformed from the camera to the object frame."""
-    import trimesh
-
-    vertices_cam, faces = read_mesh(path, cure="refine the frame again")
-    if path.suffix == ".glb":
-        vertices_cam = vertices_cam @ T_GLTF_CAM[:3, :3]
-    return trimesh.Trimesh((vertices_cam - T_cam_obj[:3, 3]) @ T_cam_obj[:3, :3], faces, process=False)
 
 
 def true_corners(labels: Sequence[KittiObject] | None, classes: Sequence[str], t_cam_ref: Tensor) -> list[Array]:

@@ -2,48 +2,40 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from directshape_torch.errors import InputError
-from directshape_torch.files.atomic_files import check_folder, write_bytes, write_json
+from directshape_torch.files.atomic_files import check_folder, json_values, write_bytes, write_json
 from directshape_torch.files.read_files import read_bytes
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.run_folder import FrameResult, result_path
-from directshape_torch.visualize.frame_source import Exporter, ExportOptions, FrameSource
-from directshape_torch.visualize.rerun_recording import RerunExporter
-from directshape_torch.visualize.run_frames import RunInputs
-from directshape_torch.visualize.surface_files import GlbExporter, PlyExporter, PointsExporter
+from directshape_torch.visualize.rerun_recording import recording
+from directshape_torch.visualize.run_frames import RunFrame, RunInputs
+from directshape_torch.visualize.surface_files import write_glb, write_ply
 
 _KITTI_FRAME = "ref: KITTI's rectified camera 0, x right, y down, z forward, metres and radians"
 
 
-class KittiExporter(Exporter):
-    """A `KittiExporter` copies `kitti/data/NNNNNN.txt` unchanged and writes its lines as `kitti/json/NNNNNN.json`."""
-
-    def add(self, source: FrameSource) -> None:
-        frame, frame_id, folder = source.result, source.frame_id, self.folder / "kitti"
-        write_bytes(folder / "data" / f"{frame_id}.txt", read_bytes(result_path(self.inputs.run.path, frame_id)))
-        content = {
-            "schema": "directshape kitti results",
-            "schema_version": 1,
-            "frame_id": frame_id,
-            "coordinates": _KITTI_FRAME,
-            "objects": [{**_columns(line), **_refinement(frame, line)} for line in frame.lines],
-        }
-        write_json(folder / "json" / f"{frame_id}.json", content)
+def write_kitti(folder: Path, frame: RunFrame) -> None:
+    """Copy the result lines of a frame unchanged, and write them as `kitti/json/NNNNNN.json`."""
+    frame_id, lines = frame.frame_id, read_bytes(result_path(frame.inputs.run.path, frame.frame_id))
+    write_bytes(folder / "kitti" / "data" / f"{frame_id}.txt", lines)
+    content = {
+        "schema": "directshape kitti results",
+        "schema_version": 1,
+        "frame_id": frame_id,
+        "coordinates": _KITTI_FRAME,
+        "objects": [{**_columns(line), **_refinement(frame.result, line)} for line in frame.result.lines],
+    }
+    write_json(folder / "kitti" / "json" / f"{frame_id}.json", content)
 
 
-FORMATS: dict[str, type[Exporter]] = {
-    "glb": GlbExporter,
-    "ply": PlyExporter,
-    "points": PointsExporter,
-    "kitti": KittiExporter,
-    "rerun": RerunExporter,
-}
+_WRITERS: dict[str, Callable[[Path, RunFrame], None]] = {"glb": write_glb, "ply": write_ply, "kitti": write_kitti}
+FORMATS = (*_WRITERS, "rerun")
 """These are the formats of `export_run` (docs/outputs.md)."""
 
 
@@ -51,17 +43,14 @@ def export_run(
     inputs: RunInputs,
     folder: Path | str,
     formats: Sequence[str],
-    options: ExportOptions | None = None,
     tell: Callable[[str], object] = lambda _: None,
 ) -> None:
     """Write the finished frames of a run in other formats (docs/outputs.md). The run itself is only read.
 
     Args:
         inputs: chosen frames of an output folder, shape prior, and the images for colours.
-        folder: folder of `glb`, `ply`, `points`, `kitti` and `recording.rrd`; existing files with the same names are
-            replaced.
+        folder: folder of `glb`, `ply`, `kitti` and `recording.rrd`; existing files with the same names are replaced.
         formats: names out of `FORMATS`.
-        options: appearance and details.
         tell: function that is called after each frame.
 
     Raises:
@@ -69,27 +58,25 @@ def export_run(
         InputError: a format is unknown, or needs images which were not given.
         DataFormatError: a file of the run or of the data set is missing, damaged or not that of the run.
     """
-    run, options = inputs.run, ExportOptions() if options is None else options
+    run = inputs.run
     check_folder("out", Path(folder))
     if not run.frame_ids:
         raise InputError("frames", f"finished frames of {run.path}", "none")
     if unknown := [name for name in formats if name not in FORMATS]:
         raise InputError("formats", f"of {', '.join(FORMATS)}", repr(unknown[0]))
-    if options.refiner is not None and not inputs.has_detections:
-        raise InputError("detections", "those of the run, to refine its frames again", "none")
-    exporters = [FORMATS[name](Path(folder), inputs, options) for name in dict.fromkeys(formats)]
+    folder, wanted = Path(folder), dict.fromkeys(formats)
+    writers: list[Callable[[RunFrame], object]] = [
+        partial(_WRITERS[name], folder) for name in wanted if name in _WRITERS
+    ]
     with ExitStack() as stack:
-        for exporter in exporters:
-            stack.callback(exporter.abandon)
+        if "rerun" in wanted:
+            writers.append(stack.enter_context(recording(folder / "recording.rrd", inputs)))
         for frame_id in run.frame_ids:
-            # All exporters of a frame share what is read and computed.
-            source = FrameSource(inputs, frame_id, options)
-            for exporter in exporters:
-                exporter.add(source)
+            # All writers of a frame share what is read and computed.
+            frame = RunFrame(inputs, frame_id)
+            for write in writers:
+                write(frame)
             tell(frame_id)
-        for exporter in exporters:
-            exporter.finish()
-        stack.pop_all()
 
 
 def _columns(line: KittiObject) -> dict[str, Any]:
@@ -107,8 +94,8 @@ def _columns(line: KittiObject) -> dict[str, Any]:
     }
 
 
-def _refinement(frame: FrameResult, line: KittiObject) -> dict[str, Any]:
-    shapes = frame.shapes
+def _refinement(result: FrameResult, line: KittiObject) -> dict[str, Any]:
+    shapes = result.shapes
     car = next((car for car, number in enumerate(shapes.input_lines) if number == line.line_number), None)
     if car is None:
         return {"status": "copied"}
@@ -121,11 +108,4 @@ def _refinement(frame: FrameResult, line: KittiObject) -> dict[str, Any]:
         "mask_iou_right": shapes.mask_iou_right[car],
         "code": shapes.codes[car],
     }
-    return {"status": shapes.statuses[car], **{name: _numbers(value.tolist()) for name, value in known.items()}}
-
-
-def _numbers(values: float | list[float]) -> Any:
-    """The values with None for NaN and infinity, which JSON does not have."""
-    if isinstance(values, list):
-        return [_numbers(value) for value in values]
-    return values if math.isfinite(values) else None
+    return {"status": shapes.statuses[car], **json_values(known)}

@@ -46,7 +46,7 @@ def make_report(
 
     Args:
         inputs: chosen frames of the output folder of `directshape refine`, and the inputs of the run. Without the shape
-            prior the page has only boxes and saved meshes.
+            prior the page has only boxes.
         page: the HTML file to write.
         most_frames: maximum number of frames with pictures and 3D views; the table has all cars in any case.
         tell: function that is called after each frame with details.
@@ -87,7 +87,9 @@ def make_report(
 
 def _notes(inputs: RunInputs, num_detailed: int) -> list[str]:
     """Notes about parts of the page that are missing or could not be used."""
-    run, dataset, notes = inputs.run, inputs.dataset, _unfinished(inputs.run.path)
+    run, dataset, notes = inputs.run, inputs.dataset, list[str]()
+    if left := read_status(run.path).num_left:
+        notes.append(f"the run has not finished ({left} frames left): the page is of what is done")
     if dataset is None:
         notes.append("no pictures and no residual maps: the images were not given (--data)")
     if run.manifest.config.get("boxes") == "masks":
@@ -97,7 +99,7 @@ def _notes(inputs: RunInputs, num_detailed: int) -> list[str]:
     if dataset is not None and dataset.masks is None:
         notes.append("no residual maps: the masks were not given (--masks)")
     if inputs.prior is None:
-        notes.append("no residual maps, and no meshes but saved ones: the prior was not given (--prior)")
+        notes.append("no residual maps and no shapes: the prior was not given (--prior)")
     if run.manifest.sha256["stereo_bias"] is not None and dataset is not None and not dataset.disparity_fields:
         notes.append("photometric residuals without the run's disparity field, so biased (--rig)")
     if num_detailed < len(run.frame_ids):
@@ -106,17 +108,12 @@ def _notes(inputs: RunInputs, num_detailed: int) -> list[str]:
     return notes + [f"{what} ({len(ids)} frame{'s' * (len(ids) != 1)})" for what, ids in found]
 
 
-def _unfinished(out_dir: Path) -> list[str]:
-    """A note on the state of the run if it has not finished."""
-    left = read_status(out_dir).num_left
-    return [f"the run has not finished ({left} frames left): the page is of what is done"] if left else []
-
-
 def _run_facts(
     run: RunFolder, rows: Sequence[CarRow], entries: Mapping[str, FrameEntry], notes: Sequence[str]
 ) -> dict[str, Any]:
     """The top of the page as JSON: counts, settings, mean errors, and notes about the page."""
-    manifest = run.manifest
+    manifest, rigs, picture = run.manifest, _rigs(run), run.path / RIG_PICTURE
+    drawn = data_url(read_rgb(picture)) if rigs and picture.is_file() else None
     return {
         "name": run.path.resolve().name,
         "package_version": manifest.package_version,
@@ -130,17 +127,9 @@ def _run_facts(
         "settings": {name: str(value) for name, value in sorted(flatten(manifest.config).items())},
         "errors": _mean_errors(rows),
         "notes": list(notes),
-        "verdict": verdict(entries, _rigs(run)),
-        "rig": _rig(run),
+        "verdict": verdict(entries, rigs),
+        "rig": {"words": [str(rig) for rig in rigs], "picture": drawn} if rigs else None,
     }
-
-
-def _rig(run: RunFolder) -> dict[str, Any] | None:
-    """The run's estimates of its rigs, in words and as a picture, or None if there are none."""
-    rigs, picture = _rigs(run), run.path / RIG_PICTURE
-    if not rigs:
-        return None
-    return {"words": [str(rig) for rig in rigs], "picture": data_url(read_rgb(picture)) if picture.is_file() else None}
 
 
 def _rigs(run: RunFolder) -> list[RigEstimate]:

@@ -80,15 +80,12 @@ def _modules() -> dict[str, str]:
         "three/orbit-controls": controls,
         **{f"report/{name.removesuffix('.js')}": _asset(name) for name in own},
     }
-    return {name: _script_url(source) for name, source in sources.items()}
+    packed_sources = {name: base64.b64encode(source.encode()).decode("ascii") for name, source in sources.items()}
+    return {name: f"data:text/javascript;base64,{text}" for name, text in packed_sources.items()}
 
 
 def _asset(name: str) -> str:
     return (_REPORT / name).read_text("utf-8")
-
-
-def _script_url(source: str) -> str:
-    return "data:text/javascript;base64," + base64.b64encode(source.encode()).decode("ascii")
 
 
 def _hash(text: str) -> str:

@@ -1,9 +1,9 @@
-"""This module colours surfaces and surface points of refined cars by the left image."""
+"""This module colours surfaces of refined cars by the left image."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -11,13 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.config import PointCloudConfig
 from directshape_torch.evaluation.shape_error import EstimatedCar
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.scene.masks import MASK_THRESHOLD
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.stereo_matching.disparity import with_disparity
-from directshape_torch.terms.car_points import car_points
 from directshape_torch.visualize.drawing import View
 from directshape_torch.visualize.drawn_car import DrawnCar
 
@@ -39,8 +36,6 @@ _MIRROR_REACH_M = 0.12
 _SAME_SURFACE_M = 0.03
 # At more grazing views a small error of the fit would take colours from beside the car.
 _LEAST_RAY_COSINE = 0.2
-_SEED = 0
-_ALL_POINTS = 10_000_000
 # These are sizes of the grid on the ground.
 _SPACING_M, _STRIP_WIDTH_M = 5.0, 0.04
 _X_M, _Z_M = (-20.0, 20.0), (0.0, 50.0)
@@ -100,13 +95,10 @@ class PaintedFrame:
         cars: refined cars, with their shapes.
         prior: the prior of the refinement.
         loaded: images, calibration and masks of the frame; None gives neutral colours.
-        mirror: whether an unseen point gets the colour of its mirror image if that is seen.
     """
 
-    def __init__(
-        self, cars: Sequence[DrawnCar], prior: ShapePrior, loaded: LoadedFrame | None, mirror: bool = True
-    ) -> None:
-        self.cars, self.loaded, self.mirror, self.view = cars, loaded, mirror, None
+    def __init__(self, cars: Sequence[DrawnCar], prior: ShapePrior, loaded: LoadedFrame | None) -> None:
+        self.cars, self.view = cars, None
         if loaded is not None:
             masks = _masks_of_lines(loaded)
             fields = [EstimatedCar(prior, torch.from_numpy(c.code), torch.from_numpy(c.T_cam_obj)) for c in cars]
@@ -117,44 +109,11 @@ class PaintedFrame:
 
         If `finer`, triangles are divided, without a change of the surface, until colours are as fine as the image.
         """
-        mesh = self._mesh(index)
+        mesh = self.cars[index].surface
+        assert mesh is not None, "the shape of a refined car is known with its prior"
         if finer and self.view is not None:
             mesh = _subdivided(mesh, self.view)
         return mesh, self._paint(index, mesh.vertices, mesh.vertex_normals)
-
-    def samples(self, index: int, count: int) -> tuple[Points, Points, Paint]:
-        """Points (count, 3) on the surface of `cars[index]`, normals (count, 3) of their triangles, and colours.
-
-        Points are uniform by area and the same in every call; normals point outwards.
-        """
-        from trimesh.sample import sample_surface
-
-        mesh = self._mesh(index)
-        points, faces = sample_surface(mesh, count, seed=_SEED)[:2]
-        points_cam, normals_cam = np.asarray(points, dtype=np.float64), np.asarray(mesh.face_normals[faces])
-        return points_cam, normals_cam, self._paint(index, points_cam, normals_cam)
-
-    def stereo_points(self) -> dict[int, tuple[Points, NDArray[np.uint8]]]:
-        """Points (N, 3), metres, and colours (N, 3) of dense stereo on each car, by its line number.
-
-        They are selected as for a refinement that fits a point cloud, after the rig's known bias is subtracted.
-        """
-        if self.loaded is None or self.view is None:
-            return {}
-        every_point = replace(PointCloudConfig(), max_points=_ALL_POINTS)
-        samples = car_points(with_disparity(self.loaded.frame), self.loaded.detections, every_point)
-        rows, points_cam = samples.object_index.numpy(), samples.points_cam.double().numpy()
-        found = {}
-        for row, detected in enumerate(self.loaded.detected_objects):
-            own = points_cam[rows == row]
-            if len(own):
-                found[detected.line_number] = own, self.view.colours(own)
-        return found
-
-    def _mesh(self, index: int) -> trimesh.Trimesh:
-        surface = self.cars[index].surface
-        assert surface is not None, "the shape of a refined car is known with its prior"
-        return surface
 
     def _paint(self, index: int, points_cam: Points, normals_cam: Points) -> Paint:
         """Colours of points on the surface of a car; see `FrameView.is_seen`."""
@@ -164,9 +123,8 @@ class PaintedFrame:
         seen = self.view.is_seen(index, points_cam, normals_cam)
         paint.rgb[seen] = self.view.colours(points_cam[seen])
         paint.source[seen] = SEEN
-        if self.mirror:
-            T_cam_obj = self.cars[index].T_cam_obj
-            _mirror(paint, (points_cam - T_cam_obj[:3, 3]) @ T_cam_obj[:3, :3])
+        T_cam_obj = self.cars[index].T_cam_obj
+        _mirror(paint, (points_cam - T_cam_obj[:3, 3]) @ T_cam_obj[:3, :3])
         return paint
 
 

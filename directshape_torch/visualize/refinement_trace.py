@@ -131,10 +131,3 @@ def _ends(minimum: CarMinimum[CarState]) -> list[CarState]:
             end = where_rows(took_part[:, number + 1], following.state, end)
         ends.append(end)
     return ends
-
-
-def without_depth(refiner: DirectShapeRefiner) -> DirectShapeRefiner:
-    """A refiner with silhouettes and priors only, whose poses drift (paper, figure of the projection's drift)."""
-    config = refiner.config
-    photometric, cloud = replace(config.photometric, weight=0.0), replace(config.point_cloud, weight=0.0)
-    return DirectShapeRefiner(refiner.prior, replace(config, photometric=photometric, point_cloud=cloud))

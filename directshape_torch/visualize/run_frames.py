@@ -1,4 +1,4 @@
-"""This module gives the frames of a run with their inputs, as far as these are available and unchanged."""
+"""This module gives the frames of a run with their inputs, as far as these are unchanged, to pages and exporters."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.io.run_folder import FrameResult, RunFolder, shapes_path
+from directshape_torch.io.kitti_labels import KittiObject, box_corners_cam, poses_cam
+from directshape_torch.io.run_folder import FrameResult, RunFolder, result_path, shapes_path
 from directshape_torch.io.run_manifest import hash_file, hash_prior
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refinement.quality import is_front_known
@@ -23,11 +23,11 @@ from directshape_torch.visualize.drawing import Array
 from directshape_torch.visualize.drawn_car import (
     DrawnCar,
     cars_after,
-    cars_before,
     corners_cam,
     mean_car,
     true_corners,
 )
+from directshape_torch.visualize.painted_cars import PaintedFrame
 
 if TYPE_CHECKING:
     import trimesh
@@ -44,7 +44,7 @@ class RunInputs:
     """
 
     run: RunFolder
-    prior: ShapePrior | None = None  # shape prior of the run; None: saved meshes or no shapes
+    prior: ShapePrior | None = None  # shape prior of the run; None: no shapes
     # Images, calibrations, masks and detections of the run's frames; None: no pictures and no colours.
     dataset: StereoDataset | None = None
     has_detections: bool = True  # whether the data set has the detections of the run, not substitutes
@@ -52,8 +52,9 @@ class RunInputs:
     problems: dict[str, set[str]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.prior is not None and hash_prior(self.prior) != self.run.manifest.sha256["prior"]:
-            raise InputError("prior", "that of the run", "another one", "name that of the run with --prior")
+        wanted = self.run.manifest.sha256["prior"]
+        if self.prior is not None and hash_prior(self.prior) != wanted:
+            raise InputError("--prior", f"the prior of the run (sha256 {wanted[:12]})", "another one")
 
     @cached_property
     def mean(self) -> trimesh.Trimesh | None:
@@ -115,6 +116,24 @@ class RunFrame:
         kept = {role: path for role, path in files.items() if role != "detections" or self.inputs.has_detections}
         return dataset.load(self.frame_id) if self._are_unchanged(kept) else None
 
+    @property
+    def images(self) -> LoadedFrame | None:
+        """The same as `loaded` for an export, which is not made of changed files.
+
+        Raises:
+            DataFormatError: the files of the data set are not those of the run.
+        """
+        if self.loaded is None and self.inputs.dataset is not None:
+            problems = ", ".join(sorted(self.inputs.problems))
+            raise DataFormatError(result_path(self.inputs.run.path, self.frame_id), f"cannot be exported: {problems}")
+        return self.loaded
+
+    @property
+    def with_images(self) -> LoadedFrame:
+        """The same as `images`, for a run with a data set."""
+        assert self.images is not None, "no data set"
+        return self.images
+
     @cached_property
     def t_cam_ref(self) -> Tensor:
         """`x_cam = x_ref + t_cam_ref` (3,), float64, from the states; zero for a frame without cars."""
@@ -129,7 +148,11 @@ class RunFrame:
         """The cars before the refinement, or None without detections."""
         if self.detections is None:
             return None
-        return cars_before(self.detections, self.t_cam_ref, self.inputs.mean, self.result.shapes.codes.shape[1])
+        # The mean shape stands at the pose of each detection, with the detection's box.
+        code, mean = np.zeros(self.result.shapes.codes.shape[1]), self.inputs.mean
+        T_cam_obj = poses_cam(self.detections, self.t_cam_ref).numpy()
+        states = zip(T_cam_obj, box_corners_cam(self.detections, self.t_cam_ref).numpy(), self.detections, strict=True)
+        return [DrawnCar(T, corners, code, mean, line.line_number) for T, corners, line in states]
 
     @cached_property
     def after(self) -> list[DrawnCar]:
@@ -141,7 +164,23 @@ class RunFrame:
         corners = corners_cam(location_ref, rotation_y, hwl, self.t_cam_ref)
         of_shapes = (shapes.input_lines.tolist(), shapes.statuses, shapes.T_cam_obj, shapes.codes)
         fronts = [is_front_known(each) for each in shapes.probabilities_heading.tolist()]
-        return cars_after(*of_shapes, corners, fronts, self.before, self.inputs.prior, self.result.mesh_files)
+        return cars_after(*of_shapes, corners, fronts, self.before, self.inputs.prior)
+
+    @cached_property
+    def refined(self) -> list[int]:
+        """Rows of the refined cars, which are the cars of `painted`, in the same order."""
+        return [row for row, car in enumerate(self.after) if car.is_refined]
+
+    @cached_property
+    def painted(self) -> PaintedFrame:
+        """Surfaces with colours.
+
+        Raises:
+            InputError: the shape prior of the run was not given.
+        """
+        if self.inputs.prior is None:
+            raise InputError("--prior", "the shape prior of the run", "nothing")
+        return PaintedFrame([self.after[row] for row in self.refined], self.inputs.prior, self.images)
 
     @property
     def truth_corners_cam(self) -> list[Array]:

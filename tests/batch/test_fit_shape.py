@@ -121,35 +121,6 @@ def test_a_car_without_points_keeps_its_box_and_touches_no_other() -> None:
         fit_shape(points[:, :2], far, prior=PRIOR)
 
 
-def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    points, _ = cars(False)
-    reflectance = np.zeros((len(points), 1), dtype=np.float32)
-    (tmp_path / "scan.bin").write_bytes(np.hstack([points.numpy(), reflectance]).astype("<f4").tobytes())
-    np.save(tmp_path / "points.npy", points.numpy())
-    far = TRUE_BOXES[:1] + torch.tensor([[50.0, 0, 0, 0, 0, 0, 0]])
-    np.savetxt(tmp_path / "boxes.txt", torch.cat([TRUE_BOXES + ERRORS, far]).numpy())
-    for name in ("scan.bin", "points.npy"):
-        words = ["--points", str(tmp_path / name), "--boxes", str(tmp_path / "boxes.txt")]
-        assert main(["fit-shape", *words, "--out", str(tmp_path / "out")]) == 0
-        said = capsys.readouterr().out
-        assert "converged" in said
-        assert "car 2: no points in this box, too_few_points\n" in said
-        boxes = np.loadtxt(tmp_path / "out" / "boxes.txt")
-        assert boxes[:2, :2] == pytest.approx(TRUE_BOXES[:, :2].numpy(), abs=0.2)
-        assert {path.name for path in (tmp_path / "out" / "meshes").iterdir()} == {"000.ply", "001.ply"}
-        with np.load(tmp_path / "out" / "shapes.npz") as arrays:
-            assert arrays["T_points_obj"].shape == (3, 4, 4)
-    (tmp_path / "boxes.txt").write_text("1 2 3\n")
-    assert main(["fit-shape", *words, "--out", str(tmp_path / "out")]) == 2
-    assert "line 1: expected 7 finite numbers, got 3: '1 2 3'" in capsys.readouterr().err
-    (tmp_path / "points.npy").write_bytes(b"nothing")
-    assert main(["fit-shape", *words, "--out", str(tmp_path / "out")]) == 2
-    assert "points.npy: is no readable npy file" in capsys.readouterr().err
-    np.save(tmp_path / "points.npy", np.zeros((0, 3)))
-    assert main(["fit-shape", *words, "--out", str(tmp_path / "out")]) == 2
-    assert "expected one point or more as numbers (P, 3 or more), got float64" in capsys.readouterr().err
-
-
 def scanned_dataset(root: Path) -> tuple[Path, Path]:
     """A data set of one frame with a scan of two cars and a file of their boxes, without images."""
     points, _ = cars(False)  # in the frame of a LiDAR
@@ -203,12 +174,10 @@ def test_boxes_of_a_fitted_scan_are_those_of_its_result_lines(tmp_path: Path) ->
     assert fit.cars.t_cam_ref[0, 0] == pytest.approx(40 / 700)
 
 
-def test_scans_need_their_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_need_their_scans(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root, boxes = scanned_dataset(tmp_path)
-    words = ["fit-shape", "--lidar", str(boxes), "--boxes", str(boxes), "--out", str(tmp_path / "out")]
-    assert main(words) == 2
-    assert "--data: expected the folder of the data set" in capsys.readouterr().err
-    assert main([*words, "--data", str(root)]) == 2
+    words = ["fit-shape", "--data", str(root), "--lidar", str(boxes), "--boxes", str(boxes)]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 2
     assert "--lidar: expected a scan of frame 000003" in capsys.readouterr().err
     with pytest.raises(InputError, match="lidar_dir"):
         fit_scan(open_dataset("kitti", root, boxes), "000003", tmp_path)

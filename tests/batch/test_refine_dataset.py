@@ -45,7 +45,7 @@ def test_cars_come_nearer_to_the_truth(shared_kitti: Path, tmp_path: Path) -> No
 def out(shared_kitti: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with all optional outputs."""
     out = tmp_path_factory.mktemp("out")
-    refine(shared_kitti, out, meshes="ply", draw=overlay_of_frame)
+    refine(shared_kitti, out, draw=overlay_of_frame)
     return out
 
 
@@ -79,10 +79,10 @@ def test_shapes_hold_states_of_the_refined_lines(out: Path) -> None:
 
 
 def test_equal_runs_write_equal_bytes(shared_kitti: Path, out: Path, tmp_path: Path) -> None:
-    refine(shared_kitti, tmp_path, meshes="ply", draw=overlay_of_frame)
+    refine(shared_kitti, tmp_path, draw=overlay_of_frame)
     first = result_files(tmp_path)
     assert first == result_files(out)
-    names = ("data/000000.txt", "shapes/000000.npz", "meshes/000000_3.ply", "overlays/000000.png", "summary.json")
+    names = ("data/000000.txt", "shapes/000000.npz", "overlays/000000.png", "summary.json")
     assert set(names) <= set(first)
     picture = cv2.imdecode(np.frombuffer(first["overlays/000000.png"], np.uint8), cv2.IMREAD_COLOR)
     assert picture.shape[1] > 1000
@@ -107,7 +107,7 @@ def test_detections_are_not_overwritten(kitti_copy: Path) -> None:
 def test_a_frame_without_cars_is_copied(kitti_copy: Path, tmp_path: Path, content: str) -> None:
     for frame_id in FRAMES:
         (kitti_copy / "detections" / "data" / f"{frame_id}.txt").write_text(content)
-    summary = refine(kitti_copy, tmp_path, meshes="glb", draw=overlay_of_frame)
+    summary = refine(kitti_copy, tmp_path, draw=overlay_of_frame)
     assert summary.exit_code == 0
     assert summary.num_cars == 0
     assert (tmp_path / "data" / "000000.txt").read_text() == content
@@ -126,7 +126,5 @@ def test_cars_without_masks_stay_as_they_were_and_a_warning_says_so(kitti_copy: 
 
 
 def test_options_are_checked() -> None:
-    with pytest.raises(InputError, match="meshes: expected one of ply, glb"):
-        RefineOptions(meshes="obj")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="batch_frames: expected at least 1, got 0"):
         RefineOptions(batch_frames=0)

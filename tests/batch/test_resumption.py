@@ -12,7 +12,7 @@ from helpers.quick_runs import FEW_STEPS, refine, result_files
 from directshape_torch.batch.resumption import join_summary
 from directshape_torch.errors import ResumeError
 from directshape_torch.io.config_files import load_config
-from directshape_torch.io.run_folder import RunFolder, summary_path
+from directshape_torch.io.run_folder import summary_path
 from directshape_torch.io.run_manifest import RunManifest, read_manifest
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -40,21 +40,12 @@ def test_further_outputs_are_added_to_finished_frames(shared_kitti: Path, tmp_pa
 
 
 def test_outputs_that_were_removed_are_made_again(shared_kitti: Path, tmp_path: Path) -> None:
-    refine(shared_kitti, tmp_path, draw=overlay_of_frame, meshes="ply")
+    refine(shared_kitti, tmp_path, draw=overlay_of_frame)
     before = result_files(tmp_path)
-    for name in ("data/000001.txt", "shapes/000001.npz", "overlays/000001.png", "meshes/000001_1.ply"):
+    for name in ("data/000001.txt", "shapes/000001.npz", "overlays/000001.png"):
         (tmp_path / name).unlink()
-        assert refine(shared_kitti, tmp_path, draw=overlay_of_frame, meshes="ply").resumed == ("000000", "000002")
+        assert refine(shared_kitti, tmp_path, draw=overlay_of_frame).resumed == ("000000", "000002")
         assert result_files(tmp_path) == before
-
-
-def test_removed_meshes_of_a_format_that_is_not_asked_for_stay_removed(shared_kitti: Path, tmp_path: Path) -> None:
-    refine(shared_kitti, tmp_path, meshes="ply")
-    refine(shared_kitti, tmp_path, meshes="glb")
-    files = RunFolder(tmp_path).read("000000").record.files_of(("meshes_ply", "meshes_glb"))
-    assert sorted(files) == [f"meshes/000000_{line}.{kind}" for line in (1, 3) for kind in ("glb", "ply")]
-    (tmp_path / "meshes" / "000000_3.ply").unlink()
-    assert refine(shared_kitti, tmp_path).resumed == refine(shared_kitti, tmp_path, meshes="glb").resumed == FRAMES
 
 
 def test_another_setting_is_named_and_nothing_is_written(shared_kitti: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`refine --tracks` refines the frames of a track in one call, writes its file and resumes with the same windows."""
+"""`refine --tracks` refines the frames of a track in one call and resumes with the same windows."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.batch.run_summary import RunSummary
 from directshape_torch.errors import ResumeError
-from directshape_torch.io.result_files import read_shapes, read_track, track_path
+from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.tracks import same_car
@@ -35,21 +35,17 @@ def refine(kitti: Path, sequence: Path, out: Path, batch_frames: int = 16, fresh
     return refine_dataset(dataset, refiner(kitti), out, RefineOptions(batch_frames=batch_frames), fresh=fresh)
 
 
-def test_views_of_a_track_share_a_shape_and_get_a_file(shared_kitti: Path, sequence: Path, tmp_path: Path) -> None:
+def test_views_of_a_track_share_a_shape(shared_kitti: Path, sequence: Path, tmp_path: Path) -> None:
     refine(shared_kitti, sequence, tmp_path)
-    frames = [read_shapes(tmp_path / "shapes" / f"{number:06d}.npz") for number in range(len(FRAMES))]
-    assert frames[0].tracks[0] == "000000"
-    track = read_track(track_path(tmp_path, "000000"))
-    assert track.frame_ids == tuple(frame.frame_id for frame in frames)
-    assert track.statuses == tuple(frame.statuses[0] for frame in frames)
-    np.testing.assert_array_equal(track.T_cam_obj, np.stack([frame.T_cam_obj[0] for frame in frames]))
-    np.testing.assert_array_equal(track.codes, np.broadcast_to(track.code, track.codes.shape))
-    assert track.parts.tolist() == [0] * len(FRAMES)
-    np.testing.assert_array_equal(track.dimensions_hwl, track.boxes_hwl[0])
-    assert np.isfinite(track.code_covariance).all()
     # Lines are those of the frame, not of the sequence's file.
     run = RunFolder(tmp_path)
     assert [len(run.read(frame_id).cars) for frame_id in run.frame_ids] == [2] * len(FRAMES)
+    frames = [run.read(frame_id).shapes for frame_id in run.frame_ids]
+    assert [frame.tracks for frame in frames] == [("000000", "000002")] * len(FRAMES)
+    assert [frame.track_parts.tolist() for frame in frames] == [[0, 0]] * len(FRAMES)
+    for frame in frames[1:]:
+        np.testing.assert_array_equal(frame.codes, frames[0].codes)
+        np.testing.assert_array_equal(frame.boxes_hwl, frames[0].boxes_hwl)
 
 
 def test_split_tracks_are_named(
@@ -60,7 +56,8 @@ def test_split_tracks_are_named(
     monkeypatch.setattr(same_car, "_of_one_car", lambda views, *_: [x for x in (views[:-2], views[-2:]) if x])
     (warning,) = refine(shared_kitti, sequence, tmp_path / "split").warnings
     assert warning == "tracks seem to be of two cars, and were split (docs/tracks.md): 000000, 000002"
-    assert read_track(track_path(tmp_path / "split", "000000")).parts.tolist() == [-1, 1, 1]
+    frames = [read_shapes(tmp_path / "split" / "shapes" / f"{number:06d}.npz") for number in range(len(FRAMES))]
+    assert [frame.track_parts[0] for frame in frames] == [-1, 1, 1]
 
 
 def test_an_interrupted_run_keeps_to_its_windows(shared_kitti: Path, sequence: Path, tmp_path: Path) -> None:
@@ -71,14 +68,6 @@ def test_an_interrupted_run_keeps_to_its_windows(shared_kitti: Path, sequence: P
     assert result_files(tmp_path) == before
     with pytest.raises(ResumeError, match="setting 'track_frames' was 16, now is 1"):
         refine(shared_kitti, sequence, tmp_path, batch_frames=1)
-
-
-def test_a_fresh_start_removes_tracks(shared_kitti: Path, sequence: Path, tmp_path: Path) -> None:
-    refine(shared_kitti, sequence, tmp_path)
-    track_path(tmp_path, "000000").rename(track_path(tmp_path, "000099"))
-    refine(shared_kitti, sequence, tmp_path, batch_frames=1, fresh=True)
-    assert not track_path(tmp_path, "000099").exists()
-    assert track_path(tmp_path, "000000").is_file()
 
 
 def test_windows_cover_every_frame_once() -> None:

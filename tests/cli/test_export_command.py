@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from helpers.finished_run import FinishedRun
 
 from directshape_torch.cli.main import main
+from directshape_torch.rig.estimate import RigEstimate
+from directshape_torch.rig.rig_file import save_rigs
 
 
 def command(run: FinishedRun, out: Path, *words: str | Path) -> list[str]:
@@ -45,59 +44,19 @@ def test_the_detections_need_not_be_named(finished: FinishedRun, tmp_path: Path)
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 
-def test_masks_and_grey_change_the_colours(finished: FinishedRun, tmp_path: Path) -> None:
+def test_masks_change_the_colours(finished: FinishedRun, tmp_path: Path) -> None:
     data = ("--format", "ply", "--data", finished.root)
     assert main(command(finished, tmp_path / "plain", *data)) == 0
     assert main(command(finished, tmp_path / "masks", *data, "--masks", finished.root / "masks")) == 0
-    assert main(command(finished, tmp_path / "grey", *data, "--unseen", "grey")) == 0
-    found = [contents(tmp_path / name)["ply/000000_1.ply"] for name in ("plain", "masks", "grey")]
-    assert len(set(found)) == 3
-
-
-@pytest.mark.parametrize(
-    ("words", "purpose"), [(("points",), "stereo points"), (("rerun", "--iterations"), "--iterations")]
-)
-def test_what_depends_on_the_runs_field_asks_for_it(
-    finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], purpose: str
-) -> None:
-    out = Path(shutil.copytree(finished.out, tmp_path / "out"))
-    summary = json.loads((out / "summary.json").read_text())
-    summary["sha256"]["stereo_bias"] = "0" * 64
-    (out / "summary.json").write_text(json.dumps(summary))
-    run = replace(finished, out=out)
-    inputs = ("--data", run.root, "--detections", run.root / "detections", "--masks", run.root / "masks")
-    assert main(command(run, tmp_path / "export", "--format", *words, *inputs)) == 2
-    said = capsys.readouterr().err
-    assert f"--rig: expected the file that the run was made with, for {purpose}, got nothing" in said
+    found = [contents(tmp_path / name)["ply/000000_1.ply"] for name in ("plain", "masks")]
+    assert found[0] != found[1]
 
 
 def test_another_rigs_field_is_refused(
     finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import torch
-
-    from directshape_torch.geometry.disparity_field import DisparityField
-    from directshape_torch.rig.rig_file import save_field
-
-    camera = finished.inputs().dataset.load("000000").frame.camera
-    rig = {"K_left": camera.K_left[0], "K_right": camera.K_right[0], "T_right_cam": camera.T_right_cam[0]}
-    hull = torch.tensor([[0.0, 0.0], [159.0, 0.0], [159.0, 119.0]])
-    save_field(DisparityField(torch.zeros(10), hull_uv=hull, size_wh=(160, 120), **rig), tmp_path / "bias.json")
-    words = ("--format", "points", "--data", finished.root, "--rig", tmp_path / "bias.json")
+    frames = finished.inputs().dataset.load("000000").frame  # type: ignore[union-attr]
+    save_rigs(tmp_path / "bias.json", [RigEstimate.of_frames(frames)])
+    words = ("--format", "glb", "--data", finished.root, "--rig", tmp_path / "bias.json")
     assert main(command(finished, tmp_path / "out", *words)) == 2
     assert "--rig: expected the disparity fields that the run was made with, got others in" in capsys.readouterr().err
-
-
-def test_a_recording_has_the_iterations_and_needs_the_inputs_of_the_run(
-    finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("rerun", reason="the extra `viewer` is not installed")
-    from rerun.chunk import RrdReader
-
-    root = finished.root
-    words = command(finished, tmp_path, "--format", "rerun", "--iterations", "--frames", "0", "--data", root)
-    assert main(words) == 2
-    assert "--detections: expected that of the run, for --iterations, got nothing" in capsys.readouterr().err
-    assert main([*words, "--detections", str(root / "detections"), "--masks", str(root / "masks")]) == 0
-    found = {chunk.entity_path for chunk in RrdReader(str(tmp_path / "recording.rrd")).stream()}
-    assert {"/world/cars/1", "/world/cars/3", "/terms/000000/1/photometric", "/world/boxes/before"} <= found

@@ -21,14 +21,14 @@ def command(root: Path, out: Path, *extra: str, masks: bool = True) -> list[str]
 
 
 def test_reports_cars_statuses_time_and_memory(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(command(kitti, tmp_path, "--meshes", "glb", "--overlays")) == 0
+    assert main(command(kitti, tmp_path, "--overlays")) == 0
     out = capsys.readouterr().out
     assert "frames   2 done, 0 failed" in out
     assert "cars     4: " in out
     assert "ms per car" in out
     assert "ms per frame" in out
     assert "MB at most" in out
-    for name in ("data/000001.txt", "shapes/000001.npz", "meshes/000001_1.glb", "overlays/000001.png"):
+    for name in ("data/000001.txt", "shapes/000001.npz", "overlays/000001.png"):
         assert (tmp_path / name).stat().st_size > 0
     timings = json.loads((tmp_path / "timings.json").read_text())
     assert timings["schema_version"] == 2

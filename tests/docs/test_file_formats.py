@@ -14,7 +14,6 @@ from helpers.kitti_folder import input_options, write_data_set
 from safetensors.torch import load_file
 
 from directshape_torch.cli.main import main
-from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.result_files import SHAPES_SCHEMA_VERSION
 from directshape_torch.io.run_manifest import MANIFEST_SCHEMA_VERSION
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -81,12 +80,3 @@ def test_prior(tmp_path: Path) -> None:
     assert table_names(text) == {*load_file(tmp_path / "prior.safetensors"), *description}
     for field in fields(PriorProvenance):
         assert f"`{field.name}`" in text
-
-
-def test_disparity_field() -> None:
-    from directshape_torch.rig import rig_file
-
-    text = section("Residual disparity field")
-    assert f'"{rig_file.FIELD}", "schema_version": {rig_file.SCHEMA_VERSION}' in text
-    for field in fields(DisparityField):
-        assert f'"{field.name}"' in text

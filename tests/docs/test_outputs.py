@@ -26,7 +26,7 @@ def test_pictures_are_small() -> None:
 def test_every_picture_of_inspect_is_listed() -> None:
     table = TEXT[TEXT.index("| file | shows |") : TEXT.index("## For other programs")]
     listed = set(re.findall(r"^\| `([\w.]+)` \|", table, re.MULTILINE))
-    assert listed == {*_FIGURES, "iterations.gif", "drift.png"}
+    assert listed == {*_FIGURES, "iterations.gif"}
 
 
 def test_what_a_trace_is_said_to_have_exists() -> None:

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 import trimesh
 from helpers.kitti_folder import FRAMES, write_disparity
 from helpers.layouts import SEQUENCE, write_folder, write_raw, write_sequence
@@ -22,10 +21,8 @@ from helpers.synthetic_scene import cached_street
 
 from directshape_torch import load_config
 from directshape_torch.batch.run_summary import RunTimings, digit_warnings
-from directshape_torch.cli.fit_shape import read_boxes
 from directshape_torch.errors import MeshError
 from directshape_torch.files.mesh_files import MESH_SUFFIXES, read_mesh
-from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.image_files import read_disparity
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_calibration import read_calibration
@@ -36,9 +33,9 @@ from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.run_status import format_status, read_status
 from directshape_torch.io.stereo_dataset import LayoutName, open_dataset
-from directshape_torch.io.velodyne import read_points, read_scan
+from directshape_torch.io.velodyne import read_scan
 from directshape_torch.rig.estimate import RigEstimate
-from directshape_torch.rig.rig_file import load_field, load_rigs, save_field, save_rigs
+from directshape_torch.rig.rig_file import load_rigs, save_rigs
 from directshape_torch.shape.load_prior import BUNDLED_PRIORS, load_prior
 from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
 from directshape_torch.visualize.make_report import make_report
@@ -84,8 +81,6 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
     (folder / "split.txt").write_text("".join(f"{name}\n" for name in FRAMES))
     write_shapes(folder / "shapes.npz", shape_arrays(2))
     write_disparity(folder / "disparity.png", np.full((12, 16), 7.5))
-    field = DisparityField.constant(-0.4, (160, 120), torch.eye(3), torch.eye(3), torch.eye(4))
-    save_field(field, folder / "field.json")
     street = cached_street()[1]
     rig = RigEstimate.of_frames(street.frames)
     rig.update(street.frames, street.detections)
@@ -93,14 +88,12 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
     calibration = folder / "lidar_calibration.txt"
     calibration.write_text((root / "training" / "calib" / f"{FRAME}.txt").read_text() + VELODYNE)
     np.linspace(-9, 9, 40, dtype="<f4").tofile(folder / "scan.bin")
-    np.save(folder / "points.npy", np.linspace(-9, 9, 30).reshape(10, 3))
     for name in ("neural_prior.safetensors", "configs/fast.yaml"):
         shutil.copyfile(ASSETS / name, folder / Path(name).name)
     corners = "v 0 0 0\nv 4 0 0\nv 0 2 0\nv 0 0 2\n"
     (folder / "mesh.obj").write_text(f"{corners}f 1 2 3\nf 1 4 2\nf 2 4 3\nf 1 3 4\n")
     for suffix in ("ply", "glb", "off", "stl"):
         trimesh.Trimesh(*read_mesh(folder / "mesh.obj"), process=False).export(folder / f"mesh.{suffix}")
-    (folder / "boxes.txt").write_text("10 2 -1 3.9 1.6 1.5 0.3\n" * 3)
 
     def scan(path: Path) -> object:
         return read_scan(path, read_calibration(calibration))
@@ -115,14 +108,11 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
         "tracking": (folder / "tracking.txt", read_tracking_objects),
         "shapes": (folder / "shapes.npz", read_shapes),
         "disparity": (folder / "disparity.png", read_disparity),
-        "field": (folder / "field.json", load_field),
         "rigs": (folder / "rigs.json", lambda path: [(each.field, str(each)) for each in load_rigs(path)]),
         "split": (folder / "split.txt", lambda path: dataset(root, split=path).frame_ids),
         "scan": (folder / "scan.bin", scan),
-        "points": (folder / "points.npy", read_points),
         "network": (folder / "neural_prior.safetensors", load_prior),
         "prior": (root / "prior.safetensors", load_prior),
-        "boxes": (folder / "boxes.txt", read_boxes),
         "times": (folder / "times.txt", read_times),
         "poses": (folder / "poses.txt", read_poses),
         **{f"mesh {suffix[1:]}": (folder / f"mesh{suffix}", solid) for suffix in MESH_SUFFIXES},

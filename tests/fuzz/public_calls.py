@@ -32,7 +32,7 @@ from directshape_torch import (
 )
 from directshape_torch.config import RefinerConfig
 from directshape_torch.rig.detections import COLUMNS
-from directshape_torch.rig.rig_file import load_field
+from directshape_torch.rig.rig_file import load_rigs
 from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.pca_fit import fit_pca
 from directshape_torch.shape.prior_file import PriorProvenance
@@ -180,7 +180,7 @@ def calls() -> dict[str, Call]:
         "fit prior": Call({"samples": prior.values(torch.eye(3, prior.num_codes).double()), **_FIT}, _fitted_prior),
         "overrides": Call({"path": None, "overrides": ["check=off"]}, lambda a: [_number(load_config(**a))]),
         "prior file": Call({"source": "pca"}, lambda a: [torch.tensor(load_prior(**a).num_codes)]),
-        "field file": Call({"path": Path("none.json")}, lambda a: [load_field(a["path"]).coefficients]),
+        "rig file": Call({"path": Path("none.json")}, lambda a: [rig.mean for rig in load_rigs(a["path"])]),
         "overlay": Call(
             street | {"frame": 0},
             lambda a: [torch.from_numpy(overlay(a["frames"], a["detections"], _result(), a["frame"]))],

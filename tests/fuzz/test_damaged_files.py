@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from directshape_torch.errors import DirectShapeError, ResumeError
 
 FORMATS = (
-    "tracking", "shapes", "disparity", "field", "rigs", "split", "points",
-    "scan", "network", "prior", "boxes", "times", "poses", "mesh obj", "mesh ply", "mesh glb", "mesh off", "mesh stl",
+    "tracking", "shapes", "disparity", "rigs", "split",
+    "scan", "network", "prior", "times", "poses", "mesh obj", "mesh ply", "mesh glb", "mesh off", "mesh stl",
     "settings", "coco", "instances", "image", "calibration", "plane", "labels", "detections", "masks", "rig",
     "frame", "raw calibration", "sequence calibration", "summary", "results", "report", "status", "timings",
     "results of a frame",
@@ -52,7 +52,7 @@ def test_damaged_files(whole: dict[str, Sample], name: str, tries: int) -> None:
     read()
     for error in errors:
         # In a whole folder another file, or the prior, may not fit the damaged one.
-        of_others = "/out/" in str(error) or "that of the run" in str(error) or isinstance(error, ResumeError)
+        of_others = "/out/" in str(error) or "the prior of the run" in str(error) or isinstance(error, ResumeError)
         assert sample.path.stem in str(error) or of_others
         assert len(str(error)) < 2500
     assert errors or not sample.is_exact

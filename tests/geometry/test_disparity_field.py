@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -12,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField, nearest_in_convex_polygon, polynomial_basis
-from directshape_torch.rig.rig_file import load_field, save_field
 
 SIZE = (1242, 375)
 
@@ -29,7 +26,7 @@ def rig() -> tuple[Tensor, Tensor, Tensor]:
 def smooth_field(hull: list[list[float]] | None = None) -> DisparityField:
     coefficients = torch.tensor([-0.3, 0.1, 0.2, -0.6, 0.05, 0.1, -0.2, 0.3, 0.1, -0.4], dtype=torch.float64)
     hull_uv = torch.tensor(hull or [[0, 0], [1241, 0], [1241, 374], [0, 374]], dtype=torch.float64)
-    return DisparityField(coefficients, hull_uv, SIZE, *rig(), provenance={"source": "lidar", "num_points": 7})
+    return DisparityField(coefficients, hull_uv, SIZE, *rig())
 
 
 def test_basis_at_a_hand_computed_pixel() -> None:
@@ -106,46 +103,6 @@ def test_another_rig_is_refused(index: int, entry: tuple[int, int], change: floa
 def test_another_image_size_is_refused() -> None:
     with pytest.raises(InputError, match=r"1242 x 375.*1224 x 370.*calibrate-rig"):
         smooth_field().check_rig((1224, 370), *rig())
-
-
-def test_save_and_load_give_the_same_field(tmp_path: Path) -> None:
-    path = tmp_path / "bias.json"
-    save_field(smooth_field(), path)
-    loaded = load_field(path)
-    uv = torch.rand(50, 2, dtype=torch.float64) * 1000
-    assert torch.equal(loaded.bias(uv), smooth_field().bias(uv))
-    assert loaded.provenance == {"source": "lidar", "num_points": 7}
-    loaded.check_rig(SIZE, *rig())
-    assert [p.name for p in tmp_path.iterdir()] == ["bias.json"]
-
-
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        ({"schema": "another"}, "is no disparity field"),
-        ({"schema_version": 99}, "version 99"),
-        ({"coefficients": [1.0, 2.0]}, "'coefficients' must be finite numbers of shape \\(10,\\)"),
-        ({"coefficients": ["a"] * 10}, "'coefficients' must be numbers"),
-        ({"hull_uv": [[0.0, 0.0], [1.0, 1.0]]}, "hull_uv"),
-        ({"K_left": None}, "'K_left'"),
-        ({"size_wh": [1242]}, "'size_wh'"),
-        ({"provenance": 3}, "'provenance'"),
-    ],
-)
-def test_a_bad_file_names_what_is_wrong(tmp_path: Path, change: dict[str, object], text: str) -> None:
-    path = tmp_path / "bias.json"
-    save_field(smooth_field(), path)
-    path.write_text(json.dumps(json.loads(path.read_text()) | change))
-    with pytest.raises(DataFormatError, match=text):
-        load_field(path)
-
-
-def test_a_missing_or_cut_file_is_a_format_error(tmp_path: Path) -> None:
-    with pytest.raises(DataFormatError, match="cannot be read"):
-        load_field(tmp_path / "none.json")
-    (tmp_path / "cut.json").write_text('{"schema": ')
-    with pytest.raises(DataFormatError, match="is not valid JSON"):
-        load_field(tmp_path / "cut.json")
 
 
 def test_wrong_tensors_are_refused() -> None:

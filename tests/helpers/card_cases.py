@@ -211,7 +211,7 @@ def run_of_files() -> dict[str, list[str]]:
         roots = [Path(folder) / device for device in ("cpu", "card")]
         write_data_set(data := Path(folder) / "data", ("000000",))
         for root in roots:
-            words = [*input_options(data)[:-1], root.name, "--rig", "none", "--overlays", "--meshes", "ply"]
+            words = [*input_options(data)[:-1], root.name, "--rig", "none", "--overlays"]
             assert command(["refine", *words, "--out", str(root)]) == 0
         names = sorted({str(p.relative_to(root)) for root in roots for p in root.rglob("*") if p.is_file()})
         _, differ, missing = filecmp.cmpfiles(*roots, names, shallow=False)

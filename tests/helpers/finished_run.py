@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder
@@ -76,7 +75,6 @@ def finished_run(
     *,
     out_name: str = "out",
     car_type: str = "Car",
-    meshes: MeshFormat | None = None,
 ) -> FinishedRun:
     """Write a data set to `folder/kitti` and refine it to `folder/out`."""
     root = folder / "kitti"
@@ -85,7 +83,7 @@ def finished_run(
     if car_type != "Car":
         for path in (*(root / "detections" / "data").glob("*.txt"), *(root / "training" / "label_2").glob("*.txt")):
             path.write_text(path.read_text().replace("Car ", f"{car_type} "))
-    refine_dataset(dataset(root, classes=(car_type,)), refiner(root), folder / out_name, RefineOptions(meshes=meshes))
+    refine_dataset(dataset(root, classes=(car_type,)), refiner(root), folder / out_name)
     return FinishedRun(root, folder / out_name)
 
 

@@ -17,7 +17,7 @@ import pytest
 from safetensors.torch import load_file, save_file
 
 from directshape_torch.errors import ConfigError, DataFormatError, DirectShapeError
-from directshape_torch.files.array_files import read_npy, read_npz
+from directshape_torch.files.array_files import read_npz
 from directshape_torch.files.mesh_files import read_mesh
 from directshape_torch.files.read_files import read_bytes, read_json
 from directshape_torch.files.text_files import read_lines, read_text
@@ -67,11 +67,13 @@ def jpeg(width: int, height: int) -> bytes:
     return bytes(content)
 
 
-@pytest.mark.parametrize("content", [png(40000, 40000), png(2**31 - 1, 2**31 - 1), jpeg(65000, 65000), jpeg(0, 8)])
+@pytest.mark.parametrize("content", [png(9000, 9000), png(2**31 - 1, 2**31 - 1), jpeg(65000, 65000), jpeg(0, 8)])
 def test_images(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(content)
-    with pytest.raises(DataFormatError, match=r"a\.png: states \d+ x \d+ pixels"):
+    with pytest.raises(
+        DataFormatError, match=r"a\.png: (states 9000 x 9000 pixels|.* exceeds limit|is no whole PNG or JPEG)"
+    ):
         read_rgb(path)
 
 
@@ -142,7 +144,7 @@ def test_only_regular_files_are_opened(tmp_path: Path, read: Callable[[Path], ob
 
 
 @pytest.mark.parametrize(
-    "read", [read_bytes, read_text, read_lines, read_json, read_npz, read_npy, read_rgb, load_config, read_mesh]
+    "read", [read_bytes, read_text, read_lines, read_json, read_npz, read_rgb, load_config, read_mesh]
 )
 @pytest.mark.parametrize("name", ["a.yaml", "a.safetensors", "a.obj"])
 def test_files_of_nothing_but_size(tmp_path: Path, read: Callable[[Path], object], name: str) -> None:

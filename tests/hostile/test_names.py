@@ -45,7 +45,7 @@ def test_records_that_climb(shared_kitti: Path, tmp_path: Path) -> None:
     assert foreign.read_text() == "mine"
 
 
-@pytest.mark.parametrize("name", ["data", "shapes", "overlays", "meshes", "tracks", "failed"])
+@pytest.mark.parametrize("name", ["data", "shapes", "overlays", "failed"])
 def test_a_folder_of_results_that_is_a_link(shared_kitti: Path, tmp_path: Path, name: str) -> None:
     foreign = tmp_path / "foreign"
     foreign.mkdir()

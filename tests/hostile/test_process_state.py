@@ -130,7 +130,7 @@ def commands(root: Path, out: Path) -> None:
         ["compare", "--labels", labels, "--before", str(root / "detections"), "--after", results, "--frames", "0"],
         ["evaluate", "--labels", labels, "--results", str(root / "detections")],
         ["calibrate-rig", *data, "--out", str(out / "rig.json")],
-        ["inspect", "--frame", "000000", "--car", "1", *with_prior, "--set", ONE_STEP, "--out", str(out / "f")],
+        ["inspect", "--frames", "000000", "--car", "1", *with_prior, "--set", ONE_STEP, "--out", str(out / "f")],
     ):
         assert main(command) == 0, command
     with suppress(SystemExit):

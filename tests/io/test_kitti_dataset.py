@@ -178,7 +178,10 @@ def cut(path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda root: cut(root / "training/image_3/000000.png"), r"image_3/000000\.png: PNG is cut short"),
+        (
+            lambda root: cut(root / "training/image_3/000000.png"),
+            r"image_3/000000\.png: cannot be read as a whole image",
+        ),
         (lambda root: (root / "training/image_2/000000.png").unlink(), r"image_2/000000\.png: cannot be read"),
         (lambda root: (root / "training/calib/000000.txt").write_text("P2: 1\n"), r"calib/000000\.txt, line 1: exp"),
         (lambda root: cut(root / "detections/data/000000.txt"), r"000000\.txt, line 1: expected 15 or 16 columns"),

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry.disparity_field import polynomial_basis
-from directshape_torch.rig.rig_file import load_fields, load_rigs, save_rigs
+from directshape_torch.rig.rig_file import load_rigs, save_rigs
 
 # Far more than any rig is off by, and less than ruins a search.
 TAME_PX = 3.5
@@ -100,7 +100,7 @@ def test_what_is_no_file_of_rigs_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "rig.json"
     path.write_text(text)
     with pytest.raises(DataFormatError, match="calibrate-rig"):
-        load_fields(path)
+        load_rigs(path)
 
 
 @pytest.mark.parametrize(("size_wh", "focal_px"), [((1224, 370), 721.0), (SIZE_WH, 707.0)])

@@ -15,7 +15,7 @@ from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.rig.from_files import gaps, observe_motion, open_sequence
 from directshape_torch.rig.motion import MotionConstraint
-from directshape_torch.rig.rig_file import load_fields
+from directshape_torch.rig.rig_file import load_rigs
 
 SIZE = (320, 160)
 FOCAL_PX, BASELINE_M, BIAS_PX = 300.0, 0.5, -0.4
@@ -145,7 +145,7 @@ def test_three_real_frames_come_near_the_field_of_ground_truth(
     assert calibrate(root / "tracking" / "0005", out, "--frames", *(f"{k:06d}" for k in range(3))) == 0
     printed = capsys.readouterr().out
     assert "from motion (3 frames)" in printed
-    (field,) = load_fields(out)
+    (field,) = (rig.field for rig in load_rigs(out))
     left, middle, right = field.bias(torch.tensor([[60.0, 180.0], [620.0, 180.0], [1180.0, 150.0]]).double()).tolist()
     assert -2.3 < left < -1.0
     assert -0.8 < middle < -0.2

@@ -20,7 +20,7 @@ from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.from_files import known_depth_from_lidar
 from directshape_torch.rig.pixels import pixel_evidence
 from directshape_torch.rig.rig import Rig
-from directshape_torch.rig.rig_file import load_fields, load_rigs
+from directshape_torch.rig.rig_file import load_rigs
 
 SIZE = (400, 160)
 FOCAL_PX, BASELINE_M = 300.0, 0.5
@@ -120,7 +120,7 @@ def calibrate(root: Path, *more: str) -> int:
 def test_command_finds_a_constant_bias_in_images(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_frame(tmp_path, "000001", bias_px=-0.6)
     assert calibrate(tmp_path) == 0
-    (field,) = load_fields(tmp_path / "bias.json")
+    (field,) = (each.field for each in load_rigs(tmp_path / "bias.json"))
     bias = field.bias(torch.tensor([[100.0, 40.0], [200.0, 80.0], [350.0, 120.0]], dtype=torch.float64))
     torch.testing.assert_close(bias, torch.full((3,), -0.6, dtype=torch.float64), atol=0.05, rtol=0)
     assert (tmp_path / "bias.png").is_file()

@@ -88,13 +88,6 @@ def test_costs_end_at_those_of_the_result(course: CarCourse) -> None:
     assert set(costs) == {*result.term_names, "sum"}
 
 
-def test_distances_end_where_the_result_is(course: CarCourse) -> None:
-    start, end = (box.mean(axis=0)[[0, 2]] for box in (course.cars[0].corners_cam, course.cars[-1].corners_cam))
-    assert course.distances[0] == 0
-    assert course.distances[-1] == pytest.approx(np.linalg.norm(end - start))
-    assert len(course.distances) == len(course.trace)
-
-
 def test_animation_moves_the_contour_in_both_images(course: CarCourse) -> None:
     frames = iteration_frames(course)
     assert len(frames) == len(course.steps)

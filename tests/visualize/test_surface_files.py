@@ -13,17 +13,12 @@ import numpy as np
 import pytest
 import torch
 from helpers.finished_run import FinishedRun
-from helpers.kitti_folder import write_disparity
-from helpers.quick_runs import dataset
 from numpy.typing import NDArray
 from plyfile import PlyData
-from scipy.spatial.transform import Rotation
 
-from directshape_torch.io.frame_layout import FrameFiles
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.visualize.export_run import export_run
-from directshape_torch.visualize.frame_source import ExportOptions
 from directshape_torch.visualize.painted_cars import MIRRORED, NEUTRAL, NEUTRAL_RGB, SEEN
 
 Floats = NDArray[np.float64]
@@ -33,7 +28,7 @@ LINES = (1, 3)
 @pytest.fixture(scope="module")
 def exported(finished: FinishedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("surfaces")
-    export_run(finished.inputs(), folder, ["glb", "ply", "points"], ExportOptions(points_per_car=3000))
+    export_run(finished.inputs(), folder, ["glb", "ply"])
     return folder
 
 
@@ -179,49 +174,6 @@ def test_glb_carries_what_is_known_of_a_car(finished: FinishedRun, exported: Pat
     np.testing.assert_allclose(extras["dimensions_hwl_m"], arrays["boxes_hwl"][1])
 
 
-# Times that do not go on, as a folder's frames may have them, cannot be those of an animation.
-@pytest.mark.parametrize(("interval_s", "played_s"), [(None, 0.1), (0.25, 0.25), (0.0, 0.1), (-0.25, 0.1)])
-def test_a_car_moves_through_the_poses_of_its_track(
-    finished: FinishedRun, tmp_path: Path, interval_s: float | None, played_s: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if interval_s is not None:
-        motion = {"000000": (7.0, None), "000001": (7.0 + interval_s, None)}
-        monkeypatch.setattr(FrameFiles, "read_motion", lambda files: motion[files.stems[0]])
-    run = finished.with_tracks(tmp_path / "run", ("000007", ""), [(0, -1), (0, -1)])
-    export_run(finished.inputs(run), tmp_path, ["glb"])
-    assert sorted(path.stem for path in (tmp_path / "glb").iterdir()) == ["000000", "000001", "track_000007"]
-    file = glb(tmp_path / "glb" / "track_000007.glb")
-    (animation,) = file.gltf.animations
-    samplers = {each.target.path: animation.samplers[each.sampler] for each in animation.channels}
-    assert all(file.gltf.nodes[each.target.node].name == "car" for each in animation.channels)
-    times = file.gltf.accessors[samplers["rotation"].input]
-    assert (times.min, times.max) == ([0.0], pytest.approx([played_s]))
-    translation, rotation = (
-        file.numbers(samplers[path].output).astype(np.float64) for path in ("translation", "rotation")
-    )
-    points = file.attribute("car", "POSITION").astype(np.float64)
-    for view, frame_id in enumerate(("000000", "000001")):
-        expected = finished.state(frame_id)["T_cam_obj"][0].astype(np.float64)
-        R = Rotation.from_quat(rotation[view]).as_matrix()
-        np.testing.assert_allclose(translation[view], expected[:3, 3], atol=1e-5)
-        np.testing.assert_allclose(R, expected[:3, :3], atol=1e-6)
-    nearest = min(("000000", "000001"), key=lambda name: finished.state(name)["T_cam_obj"][0, 2, 3])
-    T = finished.state(nearest)["T_cam_obj"][0].astype(np.float64)
-    assert np.abs(distances(finished, nearest, 0, points @ T[:3, :3].T + T[:3, 3])).max() < 0.02
-    # A viewer that plays nothing shows the first view, and y is up.
-    np.testing.assert_allclose(file.nodes["car"].translation, translation[0], atol=1e-6)
-    (root,) = file.gltf.scenes[0].nodes
-    np.testing.assert_array_equal(np.array(file.gltf.nodes[root].matrix).reshape(4, 4), np.diag([1.0, -1, -1, 1]))
-
-
-def test_what_shares_no_shape_does_not_move(finished: FinishedRun, tmp_path: Path) -> None:
-    """Of a track that was split each part is a car, if it has two views; its name says which."""
-    run = finished.with_tracks(tmp_path / "run", ("000007", "000008"), [(2, 0), (2, 1)])
-    export_run(finished.inputs(run), tmp_path, ["glb"])
-    moving = [path.stem for path in (tmp_path / "glb").iterdir() if path.stem.startswith("track")]
-    assert moving == ["track_000007_part2"]
-
-
 def ply(path: Path, columns: Sequence[str] = "xyz") -> Floats:
     """Columns of a PLY file's vertices."""
     vertex = PlyData.read(str(path))["vertex"]
@@ -241,54 +193,21 @@ def test_ply_has_the_surface_and_the_colours_of_glb(exported: Path) -> None:
     np.testing.assert_array_equal(faces, file.attribute("car_3", "indices").reshape(-1, 3))
 
 
-def test_points_lie_evenly_on_the_surface(finished: FinishedRun, exported: Path) -> None:
-    path = exported / "points" / "000000_1.ply"
-    points = ply(path)
-    assert len(points) == 3000
-    assert np.abs(distances(finished, "000000", 0, points)).max() < 0.02
-    outside = distances(finished, "000000", 0, points + 0.05 * ply(path, NORMAL))
-    assert (outside > distances(finished, "000000", 0, points)).mean() > 0.999
-    # The two halves of a symmetric surface have equal areas: 1500 points each, give or take four standard deviations.
-    T = finished.state("000000")["T_cam_obj"][0].astype(np.float64)
-    left = ((points - T[:3, 3]) @ T[:3, 2] > 0).sum()
-    assert abs(left - 1500) < 110
-    seen = ply(path, ["color_source"])[:, 0] == SEEN
-    np.testing.assert_allclose(ply(path, RGB)[seen], image_at(finished, "000000", points[seen]), atol=1.01)
-    assert 0.1 < seen.mean() < 0.5
-
-
-def test_stereo_points_are_those_of_the_disparity_map(finished: FinishedRun, tmp_path: Path) -> None:
-    """A map of constant disparity puts every point of a mask at the depth f b / d."""
-    write_disparity(tmp_path / "maps" / "000000.png", np.full((120, 160), 10.0))
-    maps = dataset(finished.root, frames=["000000"], disparity_dir=tmp_path / "maps")
-    export_run(replace(finished.inputs(RunFolder(finished.out, [0])), dataset=maps), tmp_path, ["points"])
-    path = tmp_path / "points" / "000000_1_stereo.ply"
-    points = ply(path)
-    # z_right = z + 0.004, so that the disparity is f 0.53 / z to first order.
-    np.testing.assert_allclose(points[:, 2], 150 * 0.53 / 10, rtol=5e-3)
-    mask = maps.load("000000").detections.mask_left[0].numpy() > 0.5
-    u, v = (np.rint(points[:, k] / points[:, 2] * 150 + c).astype(int) for k, c in ((0, 77), (1, 50)))
-    assert mask[v, u].all()
-    assert len(points) > 0.5 * mask.sum()
-    bgr = cv2.imread(str(finished.root / "training/image_2/000000.png"))
-    np.testing.assert_allclose(ply(path, RGB), bgr[v, u][:, ::-1], atol=1)
-
-
 def test_without_images_everything_is_grey(finished: FinishedRun, tmp_path: Path) -> None:
-    export_run(finished.inputs(with_images=False), tmp_path, ["glb", "ply", "points"])
+    export_run(finished.inputs(with_images=False), tmp_path, ["glb", "ply"])
     file = glb(tmp_path / "glb" / "000000.glb")
     assert set(file.nodes) == {"car_1", "car_3"}
     assert (file.attribute("car_1", "_COLOR_SOURCE") == NEUTRAL).all()
     assert len(np.unique(file.attribute("car_1", "COLOR_0"), axis=0)) == 1
-    assert sorted(path.name for path in (tmp_path / "points").iterdir()) == [
+    assert sorted(path.name for path in (tmp_path / "ply").iterdir()) == [
         f"{frame}_{line}.ply" for frame in ("000000", "000001") for line in LINES
     ]
 
 
 def test_equal_runs_give_equal_bytes(finished: FinishedRun, exported: Path, tmp_path: Path) -> None:
-    export_run(finished.inputs(), tmp_path, ["glb", "ply", "points"], ExportOptions(points_per_car=3000))
+    export_run(finished.inputs(), tmp_path, ["glb", "ply"])
     names = sorted(path.relative_to(exported) for path in exported.rglob("*.*"))
-    assert len(names) > 10
+    assert len(names) == 6
     for name in names:
         assert (exported / name).read_bytes() == (tmp_path / name).read_bytes(), name
 
@@ -299,8 +218,8 @@ def test_a_frame_without_refined_cars_has_no_surfaces(finished: FinishedRun, tmp
     path = out / "shapes" / "000000.npz"
     write_shapes(path, replace(read_shapes(path), statuses=("no_mask", "singular")))
     run = RunFolder(out, [0])
-    export_run(finished.inputs(run), tmp_path / "images", ["glb", "ply", "points"])
+    export_run(finished.inputs(run), tmp_path / "images", ["glb", "ply"])
     assert set(glb(tmp_path / "images" / "glb" / "000000.glb").nodes) == {"ground"}
-    export_run(finished.inputs(run, with_images=False), tmp_path / "plain", ["glb", "ply", "points"])
+    export_run(finished.inputs(run, with_images=False), tmp_path / "plain", ["glb", "ply"])
     assert glb(tmp_path / "plain" / "glb" / "000000.glb").nodes == {}
     assert not list(tmp_path.rglob("*.ply"))

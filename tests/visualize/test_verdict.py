@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.rig_rows import estimate
+from helpers.rig_rows import FOCAL_BASELINE, estimate
 from helpers.shape_arrays import shape_arrays
 
 from directshape_torch.io.run_folder import FrameRecord, frame_entry
@@ -50,4 +50,4 @@ def test_a_rig_that_is_a_guess_says_so_and_what_it_means_in_metres() -> None:
     assert f"{sigma * rig.metres_per_pixel(30):.2f} m at 30 m" in sentence
     assert sentence.endswith("0 cars hardly show it; give more frames, or --rig FILE (docs/your_rig.md)")
     assert [line[:25] for line in verdict(frames(), [rig, rig])[1:]] == [f"the disparity of rig {n} is" for n in (1, 2)]
-    assert pytest.approx(30**2 / rig.metres_per_pixel(30)) == rig._focal_baseline
+    assert rig.metres_per_pixel(30) == pytest.approx(30**2 / FOCAL_BASELINE)
