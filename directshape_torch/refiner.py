@@ -204,28 +204,26 @@ class DirectShapeRefiner(nn.Module):
         failure = refusals(everyone, seen, self.config)
         usable = Chosen.where(failure < 0 if chosen is None else (failure < 0) & chosen)
         rows, cars = usable.index, everyone.of(usable)
-        seen = seen.of(usable)
+        seen, others, candidates = seen.of(usable), detections.other_T_cam_obj, None
+        if others is not None:
+            # The import stands here, because only cars with several poses need it.
+            from directshape_torch.refinement.candidates import Candidates
 
-        def make_problem(cars: CarBatch, seen: Observation) -> CarProblem:
-            return problem_of_scene(
-                self.config, self.prior, frames, detections, cars, seen, self.extra_terms, term_weights
-            )
-
-        problem = make_problem(cars, seen)
+            candidates = Candidates.of(cars, seen, others.index_select(0, rows))
+        of_cars = (cars, seen) if candidates is None else (candidates.cars, candidates.seen)
+        problem = problem_of_scene(
+            self.config, self.prior, frames, detections, *of_cars, self.extra_terms, term_weights
+        )
         unrefined = unrefined_result(self.prior, frames, detections, failure, problem.term_names)
         if not len(rows):
             return unrefined, everyone
         initial = self._input_state(cars)
-        is_all, others = len(rows) == len(unrefined), detections.other_T_cam_obj
+        is_all = len(rows) == len(unrefined)
         beforehand = unrefined if is_all else unrefined.rows(rows)
-        if others is None:
+        if candidates is None:
             found = self._minimise(problem, initial, cars, beforehand)
         else:
-            # The import stands here, because only cars with several poses need it.
-            from directshape_torch.refinement.candidates import refined_from_candidates
-
-            own = others.index_select(0, rows)
-            found, T_cam_obj = refined_from_candidates(make_problem, cars, seen, initial, own, beforehand)
+            found, T_cam_obj = candidates.refined(problem, initial, beforehand)
             T_cam_obj = everyone.detector_T_cam_obj.index_copy(0, rows, T_cam_obj)
             everyone = replace(everyone, detector_T_cam_obj=T_cam_obj)
         result = found if is_all else replace(unrefined.put(rows, found), term_names=found.term_names)

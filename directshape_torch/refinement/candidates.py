@@ -1,15 +1,14 @@
 """This module refines cars from several poses each, and keeps the result that explains the masks best.
 
-Every pose of a car is refined on the same problem, so all results of a car have the same pixels, occluders and contour
-widths, and no pose hides another one. Their silhouettes and priors at the last stage compare. Their photometric costs
+All poses of all cars are refined in one batch, on the same pixels, occluders, contour widths and priors, and no pose
+hides another one. Their silhouettes and priors at the last stage compare. Their photometric costs
 do not: each result has its own pixels, where rays meet its surface, and even over equal pixels the differences show
 rather in which local minimum the depth ended (docs/no_boxes.md). The choice among the results has no gradient.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -36,78 +35,82 @@ They grow slowly, because the shapes of some cars mislead strongly. scripts/cali
 _OPPOSITE_COSINE = -0.5
 
 
-def refined_from_candidates(
-    make_problem: Callable[[CarBatch, Observation], CarProblem],
-    cars: CarBatch,
-    seen: Observation,
-    initial: CarState,
-    other_T_cam_obj: Tensor,  # (B, C, 4, 4), NaN where a car has fewer
-    unrefined: RefinementResult,
-) -> tuple[RefinementResult, Tensor]:
-    """The results of B cars from the best of their poses, and these poses (B, 4, 4).
+@dataclass(frozen=True)
+class Candidates:
+    """`Candidates` are R poses of B cars, number by number, each with all that is known of its car."""
 
-    The result of the lowest cost is the best one; a result that is refused is worse than any that is not.
+    T_cam_obj: Tensor  # (B, C, 4, 4) all poses
+    in_view: Tensor  # (B, C) which of them are tried
+    car: Tensor  # (R,) car of each candidate
+    # (R,) the cars with the boxes that were given: priors compare with these boxes, wherever a candidate begins
+    cars: CarBatch
+    seen: Observation  # of these R cars
 
-    Args:
-        make_problem: makes the problem of some cars of what the images show of them.
-        cars: the B cars.
-        seen: what the images show of the cars.
-        initial: input states.
-        other_T_cam_obj: poses besides the input's.
-        unrefined: what is known of the cars before the minimisation.
-    """
-    T_cam_obj = torch.cat([cars.detector_T_cam_obj[:, None], other_T_cam_obj], dim=1)
-    in_view = torch.stack([stands_in_view(T, cars.ground_normal_cam) for T in T_cam_obj.unbind(dim=1)], dim=1)
-    some = [Chosen.where(column) for column in in_view.unbind(dim=1)]
-    # All poses of all cars are refined at once, number by number.
-    car, place = torch.cat([each.index for each in some]), in_view.T.flatten().nonzero()[:, 0]
-    counts, starts = [len(each.numbers) for each in some], T_cam_obj.transpose(0, 1).flatten(0, 1)[place]
-    # The box that a result is compared and combined with is the one that it began at.
-    own = replace(joined([cars.of(each) for each in some], counts), detector_T_cam_obj=starts)
-    problem = make_problem(own, joined([seen.of(each) for each in some], counts))
-    inputs = take_rows(initial, car)
-    start = inputs._replace(T_obj_cam=se3.inverse(starts))
-    tried = Refined.of(problem, own, inputs, start, unrefined.rows(car))
-    cost, forward, refused = _of_all(tried, place, in_view.T)
-    best = cost.masked_fill(refused & ~refused.all(dim=1, keepdim=True), torch.inf).argmin(dim=1)
-    sense = probability_of_sense(cost, forward, best)
-    is_best = best[car] == place // len(in_view)
-    return _best(tried, start, is_best, car, sense), T_cam_obj[torch.arange(len(best), device=best.device), best]
+    @classmethod
+    def of(cls, cars: CarBatch, seen: Observation, other_T_cam_obj: Tensor) -> Candidates:
+        """The poses of B cars and others (B, C - 1, 4, 4), which are NaN where a car has fewer."""
+        T_cam_obj = torch.cat([cars.detector_T_cam_obj[:, None], other_T_cam_obj], dim=1)
+        views = [stands_in_view(T, cars.ground_normal_cam) for T in T_cam_obj.unbind(dim=1)]
+        some = [Chosen.where(each) for each in views]
+        counts = [len(each.numbers) for each in some]
+        return cls(
+            T_cam_obj,
+            torch.stack(views, dim=1),
+            torch.cat([each.index for each in some]),
+            joined([cars.of(each) for each in some], counts),
+            joined([seen.of(each) for each in some], counts),
+        )
 
+    @property
+    def number(self) -> Tensor:
+        """Number (R,) of each candidate among the poses of its car."""
+        return self.in_view.T.nonzero()[:, 0]
 
-def _of_all(tried: Refined[CarState], place: Tensor, in_view: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Costs (B, C), directions of the front in the camera's frame (B, C, 3), and whether results are refused (B, C).
+    def refined(
+        self, problem: CarProblem, initial: CarState, unrefined: RefinementResult
+    ) -> tuple[RefinementResult, Tensor]:
+        """The results of B cars from the best of their poses, and these poses (B, 4, 4).
 
-    The results stand at some places (R,) of the table `in_view` (C, B); the cost is infinite where there is none.
-    """
-    minimum, names = tried.minimum, tried.problem.term_names
-    left_out = torch.tensor([name in PhotometricEvidence.names for name in names], device=place.device)
-    cost = minimum.after.term_costs.masked_fill(left_out, 0.0).sum(dim=1)
-    cost = cost.masked_fill(cost.isnan(), torch.inf)
-    # The first row of R_obj_cam is the object's x axis in the camera's frame.
-    columns = (cost, torch.inf), (minimum.end.T_obj_cam[:, 0, :3], 0.0), (~is_refined(minimum.status), True)
-    cost, forward, refused = (
-        values.new_full((in_view.numel(), *values.shape[1:]), nothing).index_copy(0, place, values)
-        for values, nothing in columns
-    )
-    shape = in_view.shape
-    return cost.view(shape).T, forward.view(*shape, 3).transpose(0, 1), refused.view(shape).T
+        The result of the lowest cost is the best one; a result that is refused is worse than any that is not.
 
+        Args:
+            problem: of the R candidates.
+            initial: input states of the B cars.
+            unrefined: what is known of the B cars before the minimisation.
+        """
+        starts = self.T_cam_obj[self.car, self.number]
+        # The box that a result is compared and combined with is the one that it began at.
+        own = replace(self.cars, detector_T_cam_obj=starts)
+        inputs = take_rows(initial, self.car)
+        start = inputs._replace(T_obj_cam=se3.inverse(starts))
+        tried = Refined.of(problem, own, inputs, start, unrefined.rows(self.car))
+        cost, forward, refused = self._costs(tried)
+        best = cost.masked_fill(refused & ~refused.all(dim=1, keepdim=True), torch.inf).argmin(dim=1)
+        is_best = best[self.car] == self.number
+        states = tried.states(start, is_refined(tried.minimum.status) & is_best)
+        rows = is_best.nonzero()[:, 0]
+        result = at_states(tried.found, states).rows(rows[self.car[rows].argsort()])
+        quality = replace(result.quality, probability_heading=probability_of_sense(cost, forward, best))
+        numbers = torch.arange(len(best), device=best.device)
+        return replace(result, quality=quality), self.T_cam_obj[numbers, best]
 
-def _best(tried: Refined[CarState], start: CarState, is_best: Tensor, car: Tensor, sense: Tensor) -> RefinementResult:
-    """The result of each car from its best pose, with the graph of the backward mode.
+    def _costs(self, tried: Refined[CarState]) -> tuple[Tensor, Tensor, Tensor]:
+        """Costs (B, C), directions of the front in the camera's frame (B, C, 3), and whether results are refused.
 
-    Args:
-        tried: the R results.
-        start: where they began.
-        is_best: (R,) bool, the best result of each car.
-        car: (R,) the car of each result.
-        sense: (B,) probabilities of the sense of the headings.
-    """
-    states = tried.states(start, is_refined(tried.minimum.status) & is_best)
-    rows = is_best.nonzero()[:, 0]
-    best = at_states(tried.found, states).rows(rows[car[rows].argsort()])
-    return replace(best, quality=replace(best.quality, probability_heading=sense))
+        The cost is infinite where no candidate is tried.
+        """
+        minimum, names = tried.minimum, tried.problem.term_names
+        left_out = torch.tensor([name in PhotometricEvidence.names for name in names], device=self.car.device)
+        cost = minimum.after.term_costs.masked_fill(left_out, 0.0).sum(dim=1)
+        cost = cost.masked_fill(cost.isnan(), torch.inf)
+
+        def of_all(values: Tensor, nothing: float | bool) -> Tensor:
+            table = values.new_full((*self.in_view.shape, *values.shape[1:]), nothing)
+            return table.index_put((self.car, self.number), values)
+
+        # The first row of R_obj_cam is the object's x axis in the camera's frame.
+        forward, refused = minimum.end.T_obj_cam[:, 0, :3], ~is_refined(minimum.status)
+        return of_all(cost, torch.inf), of_all(forward, 0.0), of_all(refused, True)
 
 
 def probability_of_sense(

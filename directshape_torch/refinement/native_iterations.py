@@ -103,13 +103,15 @@ def iterated(
             loop()
         if not decide(run, tuple(sums), array(has_run[number]), array(costs[number])):
             break
+    # The host looks as rarely as it does without loops, so that histories have equal shapes.
+    count = min(-(-(number + 1) // config.block_iterations) * config.block_iterations, stage.max_iterations)
     progress.state = progress.best_state = state
     progress.damping, progress.stretched, progress.ended, progress.iterations = going
-    return list(zip(has_run[: number + 1], costs[: number + 1], strict=True))
+    return list(zip(has_run[:count], costs[:count], strict=True))
 
 
 def _rules(stage: StageConfig, config: SolverConfig, limits: Tensor, held: Tensor) -> Rules:
-    tolerances = config.step_tolerance, config.cost_tolerance
+    tolerances = float(config.step_tolerance), float(config.cost_tolerance)
     changes_damping = config.initial_damping > 0
     of_stage = float(config.max_code), float(stage.over_relaxation), *tolerances, changes_damping
     return Rules(*(array(limits), array(held), *of_stage, *_OF_SOLVER))

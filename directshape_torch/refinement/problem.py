@@ -292,7 +292,8 @@ class CarIterations(Table):
         """All iterations of a stage, if each term has a native loop and cars share nothing; see `Iterations`."""
         problem = self.stage.problem
         is_tracked = self.masks is None and problem.config.solver.jacobian == "analytic"
-        if not is_tracked or self.factors is not None or self.sharing is not INDEPENDENT:
+        has_others = self.factors is not None or bool(problem.extra_terms)
+        if not is_tracked or has_others or self.sharing is not INDEPENDENT:
             return None
         held = ~self.stage.unknowns.moving(stage.unknowns, limits.device)
         block_weights = self.layout.weight.split_with_sizes(self.layout.num_blocks)

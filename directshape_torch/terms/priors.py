@@ -125,7 +125,7 @@ class PriorTerm(Term[NoAnchor]):
 
 @dataclass(frozen=True)
 class CarPrior(PriorTerm):
-    """A `CarPrior` is a prior of `prior_terms`, or several of them in one term, whose residuals include weights."""
+    """A `CarPrior` is a prior of `prior_terms`, or several of them in one term, whose residuals have `weights`."""
 
     config: PriorConfig = field(kw_only=True)
     prior: ShapePrior = field(kw_only=True)
@@ -134,7 +134,8 @@ class CarPrior(PriorTerm):
     def native_loop(
         self, field: Field, state: State, anchor: NoAnchor, fisher: bool, turn: Turn
     ) -> NativeLoop[NoAnchor] | None:
-        if type(self.prior) is not PCAShapePrior or native_grid(field, state.T_obj_cam, self.cars.input_depth) is None:
+        is_known = type(self) is CarPrior and type(self.prior) is PCAShapePrior
+        if not is_known or native_grid(field, state.T_obj_cam, self.cars.input_depth) is None:
             return None
         from directshape_torch.kernels.priors import priors  # Numba may be missing.
 

@@ -9,17 +9,52 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from statistics import median
-from typing import Any, TypeAlias
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from benchmark_suites.timing import Row, Spread, time_interleaved
 from directshape_torch import Detections, DirectShapeRefiner, FrameBatch
 from directshape_torch.errors import MissingDependencyError
-from directshape_torch.kernels.arguments import Iteration, Rays, Turn
+from directshape_torch.kernels.arguments import Rays
 
 _OF_ROWS = "march", "silhouettes", "photometric"
-_Record: TypeAlias = list[tuple[Callable[..., Any], tuple[Any, ...]]]
+
+
+class Record:
+    """A `Record` holds calls of loops in their order, and the numbers of their arguments when each came first."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
+        self._numbers: dict[object, tuple[NDArray[Any], NDArray[Any]]] = {}
+
+    def call(self, loop: Callable[..., Any], *arguments: Any) -> Any:
+        """Call and record a loop."""
+        for array in _arrays(arguments):
+            place = array.ctypes.data, array.shape, array.strides
+            self._numbers.setdefault(place, (array, array.copy()))
+        self.calls.append((loop, arguments))
+        return loop(*arguments)
+
+    def restore(self) -> None:
+        """Give all arguments their numbers again, because loops write to them."""
+        for array, numbers in self._numbers.values():
+            array[...] = numbers
+
+    def repeat(self) -> None:
+        self.restore()
+        for loop, arguments in self.calls:
+            loop(*arguments)
+
+
+def _arrays(value: object) -> Iterator[NDArray[Any]]:
+    if isinstance(value, np.ndarray):
+        yield value
+    elif isinstance(value, tuple):
+        for each in value:
+            yield from _arrays(each)
 
 
 def loops_row(name: str, calls: Sequence[tuple[FrameBatch, Detections]], rounds: int) -> Row:
@@ -35,9 +70,10 @@ def loops_row(name: str, calls: Sequence[tuple[FrameBatch, Detections]], rounds:
             refine()  # The first use of the loops looks at their compiled code.
             with recorded_loops() as record:
                 refine()
-            sides = {"call": refine, "loops": partial(_repeat, record)}
-            seconds.append(time_interleaved(sides, rounds, of_processor=True))
-        sizes.append({name: [_num_rows(a) for loop, a in record if loop.__name__ == name] for name in _OF_ROWS})
+            sides = {"call": refine, "loops": record.repeat, "restore": record.restore}
+            times = time_interleaved(sides, rounds, of_processor=True)
+            seconds.append({"call": times["call"], "loops": times["loops"] - times["restore"]})
+        sizes.append({name: [_num_rows(a) for loop, a in record.calls if loop.__name__ == name] for name in _OF_ROWS})
     whole, share = (median(1e3 * s["call"] for s in seconds), median(s["loops"] / s["call"] for s in seconds))
     each = ", ".join(
         f"{median(len(call[name]) for call in sizes):g} of {name} ({median(sum(call[name]) for call in sizes):g} rows)"
@@ -48,49 +84,25 @@ def loops_row(name: str, calls: Sequence[tuple[FrameBatch, Detections]], rounds:
 
 
 @contextmanager
-def recorded_loops() -> Iterator[_Record]:
+def recorded_loops() -> Iterator[Record]:
     """A region whose native loops are recorded with their arguments, in order."""
     try:
         from directshape_torch.kernels import extents, iterations, march, photometric, priors, shifts, silhouettes
     except ImportError as error:
         raise MissingDependencyError("numba", "fast", "the time of native loops alone") from error
-    record: _Record = []
-
-    def recording(loop: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*arguments: Any) -> Any:
-            record.append((loop, _fresh(arguments)))
-            return loop(*arguments)
-
-        return call
-
+    record = Record()
     loops = (
         *((march, "march"), (silhouettes, "silhouettes"), (photometric, "photometric"), (priors, "priors")),
         *((iterations, "propose"), (iterations, "decide"), (shifts, "shifted"), (extents, "extents")),
     )
     compiled = [getattr(module, name) for module, name in loops]
     for (module, name), loop in zip(loops, compiled, strict=True):
-        setattr(module, name, recording(loop))
+        setattr(module, name, partial(record.call, loop))
     try:
         yield record
     finally:
         for (module, name), loop in zip(loops, compiled, strict=True):
             setattr(module, name, loop)
-
-
-def _repeat(record: _Record) -> None:
-    for loop, arguments in record:
-        loop(*_fresh(arguments))
-
-
-def _fresh(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
-    """The arguments with a copy of what says which cars a loop works on, because loops write to it."""
-
-    def fresh(each: Any) -> Any:
-        if isinstance(each, Iteration):
-            return each._replace(turn=fresh(each.turn))
-        return Turn(*(flags.copy() for flags in each)) if isinstance(each, Turn) else each
-
-    return tuple(map(fresh, arguments))
 
 
 def _num_rows(arguments: tuple[Any, ...]) -> int:

@@ -33,18 +33,24 @@ class Begun(NamedTuple):
     limits: Tensor
 
     def natively(self, count: int = 1) -> Progress[Any, Any]:
+        return self.with_costs(count)[0]
+
+    def with_costs(self, count: int) -> tuple[Progress[Any, Any], list[tuple[Tensor, Tensor]]]:
         progress, stage = replace(self.progress), replace(self.stage, max_iterations=count)
         costs = self.iterations.all_at_once(progress, stage, self.config, self.limits)
         assert costs is not None
-        assert len(costs) <= count
-        return progress
+        return progress, costs
 
     def by_tensors(self, count: int = 1) -> Progress[Any, Any]:
-        progress = replace(self.progress)
+        return self.with_costs_by_tensors(count)[0]
+
+    def with_costs_by_tensors(self, count: int) -> tuple[Progress[Any, Any], list[tuple[Tensor, Tensor]]]:
+        progress, costs = replace(self.progress), []
         for _ in range(count):
             with without_kernels():
-                iterate(self.iterations, progress, self.config, self.limits, self.stage.over_relaxation)
-        return progress
+                running, _, _ = iterate(self.iterations, progress, self.config, self.limits, self.stage.over_relaxation)
+            costs.append((running, progress.at_state.cost))
+        return progress, costs
 
 
 @pytest.fixture(autouse=True)
@@ -82,6 +88,23 @@ def test_iterations_are_those_of_the_solver(number: int, changes: list[str]) -> 
         found = start.natively(count)
         assert not torch.equal(found.state.T_obj_cam, start.progress.state.T_obj_cam)
         check_same(found, start.by_tensors(count))
+
+
+def test_costs_of_all_iterations() -> None:
+    start = begun(cost_tolerance=0.2)
+    (_, costs), (_, expected) = start.with_costs(6), start.with_costs_by_tensors(6)
+    assert len(costs) == 6
+    assert not all(bool(has_run.all()) for has_run, _ in costs)
+    for (has_run, cost), (running, true) in zip(costs, expected, strict=True):
+        assert torch.equal(has_run, running)
+        torch.testing.assert_close(cost[running], true[running], rtol=1e-4, atol=0)
+
+
+def test_codes_stop_at_their_bound() -> None:
+    start = begun("solver.max_code=0.05", number=1)
+    found = start.natively(3)
+    assert float(found.state.code.abs().max()) == pytest.approx(0.05)
+    check_same(found, start.by_tensors(3))
 
 
 def test_a_stage_that_moves_the_pose_alone() -> None:

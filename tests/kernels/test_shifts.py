@@ -61,5 +61,8 @@ def test_double_precision_takes_tensor_operations(on_demo: tuple[Photometric, Su
     term, surface = on_demo
     rows = term.pixel_set.rows
     double = rows._replace(pixel_weight=rows.pixel_weight.double(), along_ray=rows.along_ray.double())
-    found = profile(replace(term, pixel_set=term.pixel_set._replace(rows=double)), surface)
+    precise = replace(term, pixel_set=term.pixel_set._replace(rows=double))
+    found = profile(precise, surface)
     torch.testing.assert_close(found.cost_after, profile(term, surface).cost_after, rtol=1e-3, atol=1e-3)
+    with without_kernels():
+        assert torch.equal(found.cost_after, profile(precise, surface).cost_after)

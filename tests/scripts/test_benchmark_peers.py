@@ -53,7 +53,7 @@ def test_loops_that_are_repeated_write_the_same_numbers() -> None:
     with recorded_loops() as record:
         refiner(*CALL)
     assert silhouettes.silhouettes is original
-    arguments = next(arguments for loop, arguments in record if loop is original)
+    arguments = next(arguments for loop, arguments in record.calls if loop is original)
     written = arguments[-1].residual
     before = written.copy()
     written[...] = -1
