@@ -33,7 +33,7 @@ from directshape_torch.solver.iteration import (
     LEAST_DAMPING,
     MOST_DAMPING,
 )
-from directshape_torch.solver.problem import Progress
+from directshape_torch.solver.problem import Done, Progress
 from directshape_torch.state.cars import CarState
 from directshape_torch.status import Status
 from directshape_torch.terms.term import AnyTerm, Evaluation
@@ -51,7 +51,8 @@ def iterated(
     config: SolverConfig,
     limits: Tensor,
     held: Tensor,
-) -> list[tuple[Tensor, Tensor]] | None:
+    record: bool,
+) -> list[Done[Any]] | None:
     """Do the iterations and return what `solver.problem.Iterations.all_at_once` returns.
 
     Args:
@@ -63,6 +64,7 @@ def iterated(
         config: damping, acceptance, convergence.
         limits: (D,) largest trusted steps, float64.
         held: (D,) bool, which unknowns the stage fixes.
+        record: whether to keep where each iteration began.
     """
     if type(prior) is not PCAShapePrior or type(progress.state) is not CarState or config.accept_every_step:
         return None
@@ -95,19 +97,21 @@ def iterated(
         candidate=States(*map(array, candidate)),
         at_candidate=at_candidate,
     )
-    costs = limits.new_empty(stage.max_iterations, len(turn.moving))
-    has_run = torch.zeros_like(costs, dtype=torch.bool)
-    for number in range(stage.max_iterations):
+    done: list[Done[Any]] = []
+    # As without loops, some iterations follow in which no car takes part, so that histories have equal shapes.
+    while len(done) < stage.max_iterations and (turn.moving.any() or len(done) % config.block_iterations):
+        kept = state, going[0], going[1]
+        before = [map_tensors(Tensor.clone, each) for each in kept] if record else kept
+        has_run, cost = np.zeros_like(turn.moving), np.zeros_like(at.cost)
         propose(run)
         for loop in loops:
             loop()
-        if not decide(run, tuple(sums), array(has_run[number]), array(costs[number])):
-            break
-    # The host looks as rarely as it does without loops, so that histories have equal shapes.
-    count = min(-(-(number + 1) // config.block_iterations) * config.block_iterations, stage.max_iterations)
+        decide(run, tuple(sums), has_run, cost)
+        running, accepted = torch.from_numpy(has_run), torch.from_numpy(has_run & turn.taken)
+        done.append(Done(running, torch.from_numpy(cost), accepted, *before))
     progress.state = progress.best_state = state
     progress.damping, progress.stretched, progress.ended, progress.iterations = going
-    return list(zip(has_run[:count], costs[:count], strict=True))
+    return done
 
 
 def _rules(stage: StageConfig, config: SolverConfig, limits: Tensor, held: Tensor) -> Rules:

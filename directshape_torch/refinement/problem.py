@@ -23,7 +23,7 @@ from directshape_torch.rows import CarSums
 from directshape_torch.shape.field import Field, field_of
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.gauss_newton import Minimum
-from directshape_torch.solver.problem import Progress
+from directshape_torch.solver.problem import Done, Progress
 from directshape_torch.solver.sharing import INDEPENDENT, Sharing
 from directshape_torch.state.unknowns import LARGEST_ROTATION_RAD, AnyState, State, Unknowns
 from directshape_torch.terms.depth import marched_views
@@ -287,8 +287,13 @@ class CarIterations(Table):
         return self.stage.without_held(at._replace(cost=cost))
 
     def all_at_once(
-        self, progress: Progress[AnyState, Evaluation], stage: StageConfig, config: SolverConfig, limits: Tensor
-    ) -> list[tuple[Tensor, Tensor]] | None:
+        self,
+        progress: Progress[AnyState, Evaluation],
+        stage: StageConfig,
+        config: SolverConfig,
+        limits: Tensor,
+        record: bool,
+    ) -> list[Done[AnyState]] | None:
         """All iterations of a stage, if each term has a native loop and cars share nothing; see `Iterations`."""
         problem = self.stage.problem
         is_tracked = self.masks is None and problem.config.solver.jacobian == "analytic"
@@ -298,7 +303,7 @@ class CarIterations(Table):
         held = ~self.stage.unknowns.moving(stage.unknowns, limits.device)
         block_weights = self.layout.weight.split_with_sizes(self.layout.num_blocks)
         terms = tuple(zip(self.terms, progress.at_state.anchors, block_weights, strict=True))
-        return iterated(problem.prior, terms, self.rest, progress, stage, config, limits, held)
+        return iterated(problem.prior, terms, self.rest, progress, stage, config, limits, held, record)
 
     def choose(self, accepted: Tensor, new: Evaluation, old: Evaluation) -> Evaluation:
         """Take the new evaluation of cars whose step was accepted (B,), and the old one of all others."""

@@ -137,10 +137,15 @@ def _run_stage(
     iterations, at_state = begun.start(prepared)
     progress = begin(state, at_state, ended, config)
     limits = begun.step_limits().to(progress.at_state.gradient)
-    at_once = iterations.all_at_once(progress, stage, config, limits) if trajectory is None else None
-    costs += at_once or []
-    done = 0 if at_once is None else stage.max_iterations
-    while done < stage.max_iterations:
+    done = 0
+    for each in iterations.all_at_once(progress, stage, config, limits, trajectory is not None) or []:
+        done = stage.max_iterations
+        costs.append((each.running, each.cost))
+        if trajectory is not None:
+            lengths = step_lengths(each.stretched, stage.over_relaxation).to(each.damping.dtype)
+            trajectory.append(Iteration(number, each.before, each.damping, lengths, each.accepted, each.accepted))
+    # The host waits for the device once in a block.
+    while done < stage.max_iterations and bool((progress.ended < 0).any()):
         for _ in range(min(config.block_iterations, stage.max_iterations - done)):
             before, damping, stretched = progress.state, progress.damping, progress.stretched
             running, accepted, improved = iterate(iterations, progress, config, limits, stage.over_relaxation)
@@ -149,9 +154,6 @@ def _run_stage(
                 lengths = step_lengths(stretched, stage.over_relaxation).to(damping.dtype)
                 trajectory.append(Iteration(number, before, damping, lengths, accepted, improved))
             done += 1
-        # The host waits for the device at the end of a block alone.
-        if not bool((progress.ended < 0).any()):
-            break
     return progress.best_state, progress.ended, progress.iterations
 
 

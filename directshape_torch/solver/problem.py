@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Generic, Protocol, Self, SupportsIndex, TypeVar, overload
+from typing import Annotated, Generic, NamedTuple, Protocol, Self, SupportsIndex, TypeVar, overload
 
 import torch
 from torch import Tensor
@@ -85,6 +85,17 @@ class Progress(Table, Generic[StateT, EvaluationT]):
     iterations: Annotated[Tensor, Dense("B", kind="index")]
 
 
+class Done(NamedTuple, Generic[StateT]):
+    """What an iteration has `Done`; without a record `before`, `damping` and `stretched` are those of the end."""
+
+    running: Tensor  # (B,) which problems took part
+    cost: Tensor  # (B,) after it
+    accepted: Tensor  # (B,) whose steps were taken
+    before: StateT
+    damping: Tensor  # (B,) before it
+    stretched: Tensor  # (B,) before it
+
+
 class Iterations(Protocol[StateT, EvaluationT]):
     """The `Iterations` of a stage evaluate B problems."""
 
@@ -106,8 +117,13 @@ class Iterations(Protocol[StateT, EvaluationT]):
         ...
 
     def all_at_once(
-        self, progress: Progress[StateT, EvaluationT], stage: StageConfig, config: SolverConfig, limits: Tensor
-    ) -> list[tuple[Tensor, Tensor]] | None:
+        self,
+        progress: Progress[StateT, EvaluationT],
+        stage: StageConfig,
+        config: SolverConfig,
+        limits: Tensor,
+        record: bool,
+    ) -> list[Done[StateT]] | None:
         """Do all iterations of a stage by native loops, and write where they end into the progress.
 
         Args:
@@ -115,9 +131,10 @@ class Iterations(Protocol[StateT, EvaluationT]):
             stage: numbers of iterations, over-relaxation.
             config: damping, acceptance, convergence.
             limits: (D,) largest trusted step of each unknown.
+            record: whether to keep where each iteration began.
 
         Returns:
-            For each iteration which problems (B,) took part and their costs (B,) after it; None without such loops.
+            What each iteration did; None without such loops.
         """
         ...
 

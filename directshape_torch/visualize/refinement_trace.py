@@ -19,7 +19,7 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.solver.gauss_newton import minimise
-from directshape_torch.solver.problem import put_rows, where_rows
+from directshape_torch.solver.problem import put_rows
 from directshape_torch.state.cars import CarState
 from directshape_torch.status import Status
 from directshape_torch.visualize.residuals import CarResiduals, car_residuals
@@ -121,13 +121,8 @@ def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections
 def _ends(minimum: CarMinimum[CarState]) -> list[CarState]:
     """The states after each iteration: where the next iteration of the stage began, or where the stage ended."""
     stage_ends = (*minimum.stage_starts[1:], minimum.end)
-    took_part = minimum.cost_history.isfinite()
-    ends = []
     followed = zip(minimum.trajectory, [*minimum.trajectory, None][1:], strict=True)
-    for number, (iteration, following) in enumerate(followed):
-        end = stage_ends[iteration.stage]
-        if following is not None and following.stage == iteration.stage:
-            # Cars that left the batch before are in the state where their stage ended.
-            end = where_rows(took_part[:, number + 1], following.state, end)
-        ends.append(end)
-    return ends
+    return [
+        stage_ends[iteration.stage] if following is None or following.stage != iteration.stage else following.state
+        for iteration, following in followed
+    ]

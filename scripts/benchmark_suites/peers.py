@@ -134,7 +134,7 @@ def by_this_library(iterations: CarIterations, at: Evaluation, state: CarState, 
     config, limits = iterations.stage.problem.config.solver, iterations.stage.step_limits()
     progress = begin(state, at, torch.full_like(at.cost, RUNNING, dtype=torch.int64), config)
     stage = replace(iterations.stage.config, max_iterations=steps, over_relaxation=1.0)
-    if iterations.all_at_once(progress, stage, config, limits) is None:
+    if iterations.all_at_once(progress, stage, config, limits, record=False) is None:
         for _ in range(steps):
             iterate(iterations, progress, config, limits)
     return progress.state

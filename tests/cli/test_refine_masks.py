@@ -38,7 +38,7 @@ def inputs(masks: Path) -> list[str]:
 def run(masks: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run that no test changes."""
     out = tmp_path_factory.mktemp("run")
-    assert main(["refine", *inputs(masks), "--out", str(out), "--overlays", "--meshes", "ply", *QUICK]) == 0
+    assert main(["refine", *inputs(masks), "--out", str(out), "--overlays", *QUICK]) == 0
     return out
 
 
