@@ -231,8 +231,8 @@ class Family(NamedTuple):
     values: Reals  # (B * nodes,)
 
 
-class Iteration(NamedTuple):
-    """An `Iteration` is what the iterations of a stage read and write."""
+class StageRun(NamedTuple):
+    """A `StageRun` is what the iterations of a stage read and write."""
 
     rules: Rules
     family: Family

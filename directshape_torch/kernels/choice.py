@@ -51,8 +51,9 @@ def native_grid(field: object, *tensors: Tensor) -> arguments.Grid | None:
         tensors: what else a loop gets, at least one tensor of each origin.
     """
     # A subclass of the shape may look up anew.
-    is_grid = type(field) is GridShape and takes_loops(field.values, field.basis, *tensors)
-    return _grid(field) if isinstance(field, GridShape) and is_grid else None
+    if type(field) is not GridShape or not takes_loops(field.values, field.basis, *tensors):
+        return None
+    return _grid(field)
 
 
 def takes_loops(*tensors: Tensor) -> bool:

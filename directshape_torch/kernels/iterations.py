@@ -16,9 +16,9 @@ from directshape_torch.kernels.arguments import (
     Flags,
     Index,
     Iterated,
-    Iteration,
     Reals,
     Rules,
+    StageRun,
     States,
     Steps,
     Turn,
@@ -28,7 +28,7 @@ from directshape_torch.kernels.jit import SOURCES, loop, step
 
 
 @loop
-def propose(run: Iteration, _sources: int = SOURCES) -> None:
+def propose(run: StageRun, _sources: int = SOURCES) -> None:
     """Write the candidate states of cars that still move, with their steps and the values of their grids."""
     rules, at, family = run.rules, run.at, run.family
     factor = np.empty((len(rules.held), len(rules.held)))
@@ -144,9 +144,7 @@ def write_moved(rules: Rules, car: Index, move: Doubles, state: States, candidat
 
 
 @loop
-def decide(
-    run: Iteration, terms: tuple[BlockSums, ...], has_run: Flags, costs: Doubles, _sources: int = SOURCES
-) -> int:
+def decide(run: StageRun, terms: tuple[BlockSums, ...], has_run: Flags, costs: Doubles, _sources: int = SOURCES) -> int:
     """Move the cars whose cost falls to their candidates, end those that are done, and return how many still move.
 
     Whether each car took part is written to `has_run` (B,), and its cost to `costs` (B,).

@@ -10,6 +10,7 @@ Numba lets signed ones count from the end, which costs a comparison each.
 
 from __future__ import annotations
 
+import contextlib
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -19,20 +20,38 @@ import numba
 
 _FunctionT = TypeVar("_FunctionT", bound=Callable[..., object])
 
-SOURCES = zlib.crc32(b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))))
+_FILES = sorted(Path(__file__).parent.glob("*.py"))
+SOURCES = zlib.crc32(b"".join(path.read_bytes() for path in _FILES))
 """This number changes with the sources of this package."""
 
 
 def loop(function: _FunctionT) -> _FunctionT:
     """Compile a function that Python calls, and keep its code on the disk; other threads run while it works."""
     # A division by zero gives infinity or NaN, as it does in tensors.
-    return cast(_FunctionT, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    compiled = cast(_FunctionT, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    _drop_older(compiled)
+    return compiled
+
+
+def _drop_older(function: Callable[..., object]) -> None:
+    """Delete what is kept of earlier versions, because Numba fails where it names types that are gone."""
+    newest = max(path.stat().st_mtime for path in _FILES)
+    for path in _kept(function):
+        # Another process may have deleted it. Where it may not be deleted, Numba may still be able to read it.
+        with contextlib.suppress(OSError):
+            if path.stat().st_mtime < newest:
+                path.unlink()
+
+
+def _kept(function: Callable[..., object]) -> list[Path]:
+    """The lists of what is kept on the disk of a loop."""
+    folder = Path(cast(Any, function).stats.cache_path)
+    return list(folder.glob(f"*.{function.__name__}-*.nbi"))
 
 
 def is_compiled(function: Callable[..., object]) -> bool:
     """Whether the code of a loop, perhaps of older sources, is kept on the disk."""
-    name, folder = function.__name__, Path(cast(Any, function).stats.cache_path)
-    return any(folder.glob(f"*.{name}-*.nbi"))
+    return bool(_kept(function))
 
 
 def step(function: _FunctionT) -> _FunctionT:

@@ -15,8 +15,8 @@ from directshape_torch.kernels.arguments import (
     Energies,
     Family,
     Iterated,
-    Iteration,
     Rules,
+    StageRun,
     States,
     Steps,
     Turn,
@@ -38,11 +38,8 @@ from directshape_torch.state.cars import CarState
 from directshape_torch.status import Status
 from directshape_torch.terms.term import AnyTerm, Evaluation
 
-_OF_DAMPING = DAMPING_DECREASE, DAMPING_INCREASE, LEAST_DAMPING, MOST_DAMPING
-_OF_SOLVER = *_OF_DAMPING, FLAT, LEAST_DIAGONAL, LEAST_PIVOT, Status.converged.code, Status.singular.code
 
-
-def iterated(
+def iterate_natively(
     prior: ShapePrior,
     terms: Sequence[tuple[AnyTerm, object, Tensor]],
     rest: Tensor | None,
@@ -85,7 +82,7 @@ def iterated(
 
     going = [_copied(x) for x in (progress.damping, progress.stretched, progress.ended, progress.iterations)]
     at, at_candidate = (Energies(*(array(_copied(x)) for x in progress.at_state[:3])) for _ in range(2))
-    run = Iteration(
+    run = StageRun(
         rules=_rules(stage, config, limits, held),
         family=Family(array(prior.mean).reshape(-1), array(prior.basis.flatten(0, 2).T), grid.values),
         rest=np.zeros_like(at.cost) if rest is None else array(rest),
@@ -115,10 +112,24 @@ def iterated(
 
 
 def _rules(stage: StageConfig, config: SolverConfig, limits: Tensor, held: Tensor) -> Rules:
-    tolerances = float(config.step_tolerance), float(config.cost_tolerance)
-    changes_damping = config.initial_damping > 0
-    of_stage = float(config.max_code), float(stage.over_relaxation), *tolerances, changes_damping
-    return Rules(*(array(limits), array(held), *of_stage, *_OF_SOLVER))
+    return Rules(
+        largest_step=array(limits),
+        held=array(held),
+        max_code=float(config.max_code),
+        over_relaxation=float(stage.over_relaxation),
+        step_tolerance=float(config.step_tolerance),
+        cost_tolerance=float(config.cost_tolerance),
+        changes_damping=config.initial_damping > 0,
+        damping_decrease=DAMPING_DECREASE,
+        damping_increase=DAMPING_INCREASE,
+        least_damping=LEAST_DAMPING,
+        most_damping=MOST_DAMPING,
+        flat=FLAT,
+        least_diagonal=LEAST_DIAGONAL,
+        least_pivot=LEAST_PIVOT,
+        converged=Status.converged.code,
+        singular=Status.singular.code,
+    )
 
 
 def _copied(tensor: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from directshape_torch.config import RefinerConfig, SolverConfig, StageConfig
 from directshape_torch.numerics.gradient_mode import map_tensors
 from directshape_torch.numerics.records import Dense
 from directshape_torch.numerics.tables import Table
-from directshape_torch.refinement.native_iterations import iterated
+from directshape_torch.refinement.native_iterations import iterate_natively
 from directshape_torch.rows import CarSums
 from directshape_torch.shape.field import Field, field_of
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -303,7 +303,7 @@ class CarIterations(Table):
         held = ~self.stage.unknowns.moving(stage.unknowns, limits.device)
         block_weights = self.layout.weight.split_with_sizes(self.layout.num_blocks)
         terms = tuple(zip(self.terms, progress.at_state.anchors, block_weights, strict=True))
-        return iterated(problem.prior, terms, self.rest, progress, stage, config, limits, held, record)
+        return iterate_natively(problem.prior, terms, self.rest, progress, stage, config, limits, held, record)
 
     def choose(self, accepted: Tensor, new: Evaluation, old: Evaluation) -> Evaluation:
         """Take the new evaluation of cars whose step was accepted (B,), and the old one of all others."""

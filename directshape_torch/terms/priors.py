@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -148,20 +148,21 @@ class CarPrior(PriorTerm):
     def _constants(self) -> PriorArrays:
         cars, prior, like = self.cars, cast(PCAShapePrior, self.prior), self.cars.input_depth
         pose_sigma = detector_pose_sigma(self.config, cars) if "pose" in self.weights else like.new_empty(len(cars), 4)
-        sigma_px = cars.offset_sigma_px
-        tensors = (
-            cars.ground_normal_cam,
-            cars.ground_offset,
-            cars.detector_hwl,
-            prior.dimensions_mean_hwl,
-            prior.dimensions_basis_hwl,
-            constant_like(self.config.dimensions_sigma_m, like),
-            cars.detector_T_cam_obj,
-            pose_sigma,
-            like.new_empty(len(cars), 0) if sigma_px is None else sigma_px[:, None],
+        no_offset = like.new_empty(len(cars), 0)
+        weights = {f"{name}_weight": float(self.weights.get(name, 0.0)) for name in PRIORS}
+        return PriorArrays(
+            **weights,
+            tilts_by_cosine=self.config.tilt_form == "cosine",
+            ground_normal_cam=array(cars.ground_normal_cam),
+            ground_offset=array(cars.ground_offset),
+            detector_hwl=array(cars.detector_hwl),
+            hwl_mean=array(prior.dimensions_mean_hwl),
+            hwl_basis=array(prior.dimensions_basis_hwl),
+            hwl_sigma=array(constant_like(self.config.dimensions_sigma_m, like)),
+            detector_T_cam_obj=array(cars.detector_T_cam_obj),
+            pose_sigma=array(pose_sigma),
+            offset_sigma_px=array(no_offset if cars.offset_sigma_px is None else cars.offset_sigma_px[:, None]),
         )
-        weights: list[Any] = [float(self.weights.get(name, 0.0)) for name in PRIORS]
-        return PriorArrays(*(*weights, self.config.tilt_form == "cosine", *map(array, tensors)))
 
 
 def prior_terms(config: PriorConfig, prior: ShapePrior, cars: CarBatch) -> list[PriorTerm]:

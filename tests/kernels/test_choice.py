@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import logging
 import os
+import pickle
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -138,3 +139,9 @@ def test_code_is_kept_where_the_folder_of_the_package_cannot_be_written(tmp_path
     ]
     assert [done.stdout.split() for done in hits] == [["False", "0"], ["True", "1"]]
     assert list((tmp_path / "cache").rglob("*.nbc"))
+    # An earlier version of the package has left a list that names a type which this version lacks.
+    (kept,) = (tmp_path / "cache").rglob("*.nbi")
+    kept.write_bytes(pickle.dumps(numba.__version__) + b"cdirectshape_torch.kernels.arguments\nGone\n.")
+    os.utime(kept, (0, 0))
+    anew = subprocess.run([sys.executable, "-c", command], env=environment, capture_output=True, text=True, check=True)
+    assert anew.stdout.split() == ["False", "0"]
