@@ -120,14 +120,14 @@ def write_values(family: Family, code: Reals, first: Index) -> None:
 @step
 def write_moved(rules: Rules, car: Index, move: Doubles, state: States, candidate: States) -> None:
     """Write the state after a step (`Unknowns.retract`)."""
-    num_codes, pose, moved = state.code.shape[1], state.T_obj_cam[car], candidate.T_obj_cam[car]
+    num_codes, T, moved = state.code.shape[1], state.T_obj_cam[car], candidate.T_obj_cam[car]
     v, w = (move[0], move[1], move[2]), (move[3], move[4], move[5])
     angle_squared = dot(w, w)
     second, third = 0.0, 0.0
     for coefficients in EXP_SERIES:
         second, third = coefficients[0] - second * angle_squared, coefficients[1] - third * angle_squared
     for column in range(4):
-        point = (np.float64(pose[0, column]), np.float64(pose[1, column]), np.float64(pose[2, column]))
+        point = (np.float64(T[0, column]), np.float64(T[1, column]), np.float64(T[2, column]))
         across = cross(w, point)
         # With the matrix W of w, the rotation is I + W + second W^2 + third W^3, and W^3 = -angle^2 W.
         point = plus(plus(point, 1.0 - third * angle_squared, across), second, cross(w, across))
@@ -135,7 +135,7 @@ def write_moved(rules: Rules, car: Index, move: Doubles, state: States, candidat
             across = cross(w, v)
             point = plus(plus(plus(point, 1.0, v), second, across), third, cross(w, across))
         moved[0, column], moved[1, column], moved[2, column] = point
-        moved[3, column] = pose[3, column]
+        moved[3, column] = T[3, column]
     for k in range(num_codes):
         code = state.code[car, k] + move[6 + k]
         candidate.code[car, k] = min(max(code, -rules.max_code), rules.max_code)

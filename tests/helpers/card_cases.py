@@ -34,7 +34,6 @@ from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.scene.masks import MaskCrops
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.solver import gauss_newton
 from helpers.car_counts import with_cars
 from helpers.five_cars import five_cars, with_solver
 from helpers.kitti_folder import input_options, write_data_set
@@ -131,11 +130,10 @@ def _difference(found: Tensor, expected: Tensor) -> float:
 
 
 def waits_of_blocks(tracks: bool = False) -> dict[str, Any]:
-    """Waits of the host, by operation, in calls of one and two blocks a stage, and in one that cars leave early."""
+    """Waits of the host, by operation, in calls of one and two blocks a stage, and in one where cars end early."""
     prior, frames, detections = _numbered() if tracks else five_cars()
     inputs = frames.to(CARD), detections.to(CARD)
     block = 2
-    # Else all of the toys stay until the last block of a stage.
     leaving = with_solver(replace(_SHIPPED, check="off"), cost_tolerance=0.1, block_iterations=block)
     staying = with_solver(leaving, cost_tolerance=0.0, step_tolerance=0.0)
     of_config = _SHIPPED.stages[-1:] if tracks else _SHIPPED.stages
@@ -143,7 +141,7 @@ def waits_of_blocks(tracks: bool = False) -> dict[str, Any]:
     def counted(config: RefinerConfig, iterations: int) -> tuple[dict[str, int], list[int]]:
         stages = tuple(replace(stage, max_iterations=iterations) for stage in of_config)
         refiner = DirectShapeRefiner(copy.deepcopy(prior).to(CARD), replace(config, stages=stages))
-        with noted_waits() as waits, mock.patch.object(gauss_newton, "_WORTH_LEAVING_OUT", 1):
+        with noted_waits() as waits:
             result = refiner(*inputs)
         return Counter(waits), result.iterations.tolist()
 
@@ -154,7 +152,7 @@ def waits_of_blocks(tracks: bool = False) -> dict[str, Any]:
         "blocks of cars": [-(-count // block) for count in left[1]],
         "one block": one[0],
         "two blocks": two[0],
-        "cars leave": left[0],
+        "cars end": left[0],
     }
 
 

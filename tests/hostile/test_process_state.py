@@ -66,7 +66,7 @@ def forward(_: Path, __: Path) -> None:
 
 
 def run(root: Path, out: Path) -> None:
-    options = RefineOptions("ply", draw=overlay_of_frame, threads=2)
+    options = RefineOptions(draw=overlay_of_frame, threads=2)
     one = dataset(root, frames=["000000"])
     refine_dataset(one, refiner(root), out / "out", options)
 

@@ -91,7 +91,7 @@ def test_times_are_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert f"PyTorch {torch.__version__}" in lines[0]
     (a_call,) = (line for line in lines if line.startswith("demo, 1 frame in a call, default: ms a call"))
     operations, memory = a_call.split("  ")[-1].split(", ")[:2]
-    assert int(operations.split()[0]) > 10_000
+    assert int(operations.split()[0]) > 1_000
     assert 0 < float(memory.split()[0]) < 100
 
 
