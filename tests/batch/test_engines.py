@@ -134,7 +134,8 @@ def test_two_workers_of_which_one_is_killed_write_the_bytes_of_one_process(root:
     summary = refine(root, tmp_path / "two", QuickRefiner(root), **options)
     died_at = (tmp_path / "note").stat().st_mtime
     before, after = ((tmp_path / "two" / "shapes" / f"{name}.npz").stat().st_mtime for name in FRAMES[2:4])
-    assert before < died_at < after
+    # The clock of files may stand still for some milliseconds.
+    assert before <= died_at <= after
     assert summary.exit_code == 0
     assert sorted(listener.ended) == [(frame_id, True) for frame_id in FRAMES]
     expected, found = result_files(tmp_path / "one"), result_files(tmp_path / "two")
