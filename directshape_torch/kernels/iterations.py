@@ -144,12 +144,14 @@ def write_moved(rules: Rules, car: Index, move: Doubles, state: States, candidat
 
 
 @loop
-def decide(run: StageRun, terms: tuple[BlockSums, ...], has_run: Flags, costs: Doubles, _sources: int = SOURCES) -> int:
-    """Move the cars whose cost falls to their candidates, end those that are done, and return how many still move.
+def decide(
+    run: StageRun, terms: tuple[BlockSums, ...], has_run: Flags, costs: Doubles, _sources: int = SOURCES
+) -> None:
+    """Move the cars whose cost falls to their candidates, and end those that are done.
 
     Whether each car took part is written to `has_run` (B,), and its cost to `costs` (B,).
     """
-    turn, num_moving = run.turn, 0
+    turn = run.turn
     add_up(run.rules, terms, run.rest, turn, run.at_candidate)
     for car in range(np.uint64(len(run.rest))):
         has_run[car] = turn.moving[car]
@@ -158,9 +160,7 @@ def decide(run: StageRun, terms: tuple[BlockSums, ...], has_run: Flags, costs: D
             if accepted:
                 move_on(car, run.candidate, run.state, run.at_candidate, run.at)
             turn.taken[car], turn.moving[car] = accepted, run.progress.ended[car] < 0
-            num_moving += 1 if turn.moving[car] else 0
         costs[car] = run.at.cost[car]
-    return num_moving
 
 
 @step

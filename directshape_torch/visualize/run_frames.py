@@ -118,7 +118,7 @@ class RunFrame:
 
     @property
     def images(self) -> LoadedFrame | None:
-        """The same as `loaded` for an export, which is not made of changed files.
+        """The frame with its images, as `loaded` has it; exports refuse files that have changed since the run.
 
         Raises:
             DataFormatError: the files of the data set are not those of the run.
@@ -130,7 +130,7 @@ class RunFrame:
 
     @property
     def with_images(self) -> LoadedFrame:
-        """The same as `images`, for a run with a data set."""
+        """The frame with its images, where the caller has made sure that the run has its data set; see `images`."""
         assert self.images is not None, "no data set"
         return self.images
 

@@ -76,7 +76,7 @@ def test_frames_of_two_rigs_are_refined_in_one_run(
     save_rigs(tmp_path / "more.json", [first, second])
     assert main(command(source, tmp_path / "by_file", "--rig", str(tmp_path / "more.json"))) == 2
     assert "detector_sigmas" in capsys.readouterr().err
-    # So does another field.
+    # With another disparity field a run does not go on either.
     first, second = load_rigs(tmp_path / "out" / "rig.json")
     first.add_rows(first.rows[:1] + 0.01)
     save_rigs(tmp_path / "more.json", [first, second])

@@ -66,7 +66,7 @@ OTHER_FORMS = with_solver(
     initial_damping=0.0,
     accept_every_step=True,
 )
-# Of views of tracks as well as of cars by themselves, in one stage.
+# Views of tracks and cars by themselves are both differentiated with these settings, in one stage.
 UNROLLED = replace(_FEW_STEPS, stages=_FEW_STEPS.stages[-1:], backward=replace(DEFAULT.backward, mode="unroll"))
 
 

@@ -17,7 +17,7 @@ from public_functions import CASES
 from torch import Tensor
 
 HALF = (torch.bfloat16, pytest.param(torch.float16, marks=pytest.mark.long))
-# The others ignore what they are given.
+# Functions without the argument `n` ignore the numbers that they are given.
 TAKE_NUMBERS = [name for name, case in CASES.items() if "n" in signature(case).parameters]
 
 
