@@ -102,10 +102,19 @@ class Contour(NamedTuple):
     max_cells: int
 
 
+class Columns(NamedTuple):
+    """`Columns` are the first columns of the blocks of the tangent, as `state.unknowns` orders them."""
+
+    pose: int
+    code: int
+    offset: int
+
+
 class Sums(NamedTuple):
-    """`Sums` are the fields of `terms.term.Part` of M blocks that a loop writes, and where its columns begin."""
+    """`Sums` are the fields of `terms.term.Part` of M blocks that a loop writes, and which columns the term sees."""
 
     first: int
+    num_columns: int
     cost: Doubles  # (M,)
     products: Doubles  # (M, D + 1, D)
     information: (
@@ -205,6 +214,7 @@ class Steps(NamedTuple):
 class Rules(NamedTuple):
     """`Rules` are the settings of a stage's iterations and the constants of the solver."""
 
+    columns: Columns
     largest_step: Doubles  # (D,) trusted
     held: Flags  # (D,) whether the stage fixes an unknown
     max_code: float

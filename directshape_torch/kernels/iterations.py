@@ -120,8 +120,9 @@ def write_values(family: Family, code: Reals, first: Index) -> None:
 @step
 def write_moved(rules: Rules, car: Index, move: Doubles, state: States, candidate: States) -> None:
     """Write the state after a step (`Unknowns.retract`)."""
-    num_codes, T, moved = state.code.shape[1], state.T_obj_cam[car], candidate.T_obj_cam[car]
-    v, w = (move[0], move[1], move[2]), (move[3], move[4], move[5])
+    columns, T, moved = rules.columns, state.T_obj_cam[car], candidate.T_obj_cam[car]
+    of_pose = move[columns.pose :]
+    v, w = (of_pose[0], of_pose[1], of_pose[2]), (of_pose[3], of_pose[4], of_pose[5])
     angle_squared = dot(w, w)
     second, third = 0.0, 0.0
     for coefficients in EXP_SERIES:
@@ -136,11 +137,11 @@ def write_moved(rules: Rules, car: Index, move: Doubles, state: States, candidat
             point = plus(plus(plus(point, 1.0, v), second, across), third, cross(w, across))
         moved[0, column], moved[1, column], moved[2, column] = point
         moved[3, column] = T[3, column]
-    for k in range(num_codes):
-        code = state.code[car, k] + move[6 + k]
+    for k in range(state.code.shape[1]):
+        code = state.code[car, k] + move[columns.code + k]
         candidate.code[car, k] = min(max(code, -rules.max_code), rules.max_code)
     for k in range(state.offset_px.shape[1]):
-        candidate.offset_px[car, k] = state.offset_px[car, k] + move[6 + num_codes + k]
+        candidate.offset_px[car, k] = state.offset_px[car, k] + move[columns.offset + k]
 
 
 @loop

@@ -93,8 +93,8 @@ def photometric(
 ) -> None:
     """Write the sums of blocks and the surface under their pixels, which is tracked from that of a nearby state."""
     num_rows, num_offsets = rays.ray_cam.shape[2], offsets.px.shape[1]
-    num_shape = 6 + grid.basis.shape[1]
-    J = np.zeros((num_rows, num_shape + num_offsets), np.float32)
+    # The offset, if there is one, has the last column.
+    J = np.zeros((num_rows, out.num_columns), np.float32)
     weighted = np.empty((num_rows, J.shape[1] + 1), np.float32)
     room, found, patches = room_for(num_rows), found_for(num_rows), patches_for(num_rows)
     compared = compared_for(len(pixels.intensity_left), num_rows)
@@ -112,7 +112,7 @@ def photometric(
         write_where(now.on_surface[number], block, found, last, of_block(now.points_obj, number))
         write_gradient_where(now.on_surface[number], found, normal, of_block(now.normal_obj, number))
         if num_offsets:
-            write_offset(tracking, offsets, car, depth, found.depth_per_sdf, J[:, num_shape])
+            write_offset(tracking, offsets, car, depth, found.depth_per_sdf, J[:, out.num_columns - 1])
         for row in range(np.uint64(num_rows)):
             usable[row] = now.on_surface[number, row]
         compare(pixels, comparison, number, depth, patches, compared, usable)

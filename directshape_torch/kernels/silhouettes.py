@@ -59,7 +59,7 @@ def silhouettes(
     _sources: int = SOURCES,
 ) -> None:
     """Write the sums of blocks and the closest points of their rays, which begin at those of a nearby state."""
-    num_rows, num_columns = rays.ray_cam.shape[2], 6 + grid.basis.shape[1]
+    num_rows, num_columns = rays.ray_cam.shape[2], out.num_columns
     J, weighted = np.empty((num_rows, num_columns), np.float32), np.empty((num_rows, num_columns + 1), np.float32)
     wants_fisher, informed = out.information.shape[1] > 0, np.empty_like(weighted)
     room, walk, start, three = (

@@ -12,6 +12,7 @@ from torch import Tensor
 from directshape_torch.config import SolverConfig, StageConfig
 from directshape_torch.kernels.arguments import (
     BlockSums,
+    Columns,
     Energies,
     Family,
     Iterated,
@@ -36,7 +37,7 @@ from directshape_torch.solver.iteration import (
 from directshape_torch.solver.problem import Done, Progress
 from directshape_torch.state.cars import CarState
 from directshape_torch.status import Status
-from directshape_torch.terms.term import AnyTerm, Evaluation
+from directshape_torch.terms.term import AnyTerm, Evaluation, native_columns
 
 
 def iterate_natively(
@@ -83,7 +84,7 @@ def iterate_natively(
     going = [_copied(x) for x in (progress.damping, progress.stretched, progress.ended, progress.iterations)]
     at, at_candidate = (Energies(*(array(_copied(x)) for x in progress.at_state[:3])) for _ in range(2))
     run = StageRun(
-        rules=_rules(stage, config, limits, held),
+        rules=_rules(native_columns(state.unknowns), stage, config, limits, held),
         family=Family(array(prior.mean).reshape(-1), array(prior.basis.flatten(0, 2).T), grid.values),
         rest=np.zeros_like(at.cost) if rest is None else array(rest),
         state=States(*map(array, state)),
@@ -111,8 +112,9 @@ def iterate_natively(
     return done
 
 
-def _rules(stage: StageConfig, config: SolverConfig, limits: Tensor, held: Tensor) -> Rules:
+def _rules(columns: Columns, stage: StageConfig, config: SolverConfig, limits: Tensor, held: Tensor) -> Rules:
     return Rules(
+        columns=columns,
         largest_step=array(limits),
         held=array(held),
         max_code=float(config.max_code),

@@ -30,7 +30,7 @@ from directshape_torch.shape.shape_prior import DimensionsDerivative, ShapePrior
 from directshape_torch.state.cars import CarBatch
 from directshape_torch.state.unknowns import CODE, OFFSET, POSE, State
 from directshape_torch.terms import robust
-from directshape_torch.terms.term import AnyTerm, Linear, NativeLoop, NoAnchor, Term, part_to_write
+from directshape_torch.terms.term import AnyTerm, Linear, NativeLoop, NoAnchor, Term, native_columns, part_to_write
 
 PRIORS = "shape", "height", "tilt", "dimensions", "pose", "rig"
 """These are the names of all priors."""
@@ -142,7 +142,8 @@ class CarPrior(PriorTerm):
         # Nobody reads the residuals of priors.
         part, sums = part_to_write(self, state, anchor, (len(self.cars), 0, 1), False)
         states = States(*map(array, tuple(state)[:3]))
-        return NativeLoop(partial(priors, self._constants, states, turn, sums), part)
+        columns = native_columns(state.unknowns)
+        return NativeLoop(partial(priors, self._constants, columns, states, turn, sums), part)
 
     @cached_property
     def _constants(self) -> PriorArrays:
@@ -217,8 +218,8 @@ def prior_terms(config: PriorConfig, prior: ShapePrior, cars: CarBatch) -> list[
 
 def with_joined_priors(terms: Sequence[AnyTerm]) -> tuple[AnyTerm, ...]:
     """The terms with the priors of `prior_terms` in one, because an iteration needs only their sum."""
-    priors = [term for term in terms if isinstance(term, CarPrior)]
-    others = [term for term in terms if not isinstance(term, CarPrior)]
+    priors = [cast(CarPrior, term) for term in terms if set(term.names) <= set(PRIORS)]
+    others = [term for term in terms if not set(term.names) <= set(PRIORS)]
     return (*others, _joined(priors)) if priors else tuple(others)
 
 

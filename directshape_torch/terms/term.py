@@ -17,13 +17,13 @@ from torch import Tensor
 from directshape_torch.compile import compilable
 from directshape_torch.config import StageConfig
 from directshape_torch.errors import InputError
-from directshape_torch.kernels.arguments import Sums, Turn
+from directshape_torch.kernels.arguments import Columns, Sums, Turn
 from directshape_torch.kernels.choice import array, every_turn
 from directshape_torch.numerics.tables import Table
 from directshape_torch.rows import Blocks, CarSums
 from directshape_torch.shape.field import Field, field_of
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.state.unknowns import CODE, POSE, State
+from directshape_torch.state.unknowns import CODE, OFFSET, POSE, State, Unknowns
 from directshape_torch.terms.depth import Closest, Hits
 from directshape_torch.terms.robust import RobustValue
 
@@ -196,6 +196,11 @@ class NativeLoop(NamedTuple, Generic[AnchorT]):
         return self.part
 
 
+def native_columns(unknowns: Unknowns) -> Columns:
+    """Where the blocks of a car begin, for native loops."""
+    return Columns(*(unknowns.span(name).start for name in (POSE, CODE, OFFSET)))
+
+
 def part_to_write(
     term: Term[AnchorT], state: State, anchor: AnchorT, shape: tuple[int, int, int], own_information: bool
 ) -> tuple[Part[AnchorT], Sums]:
@@ -206,11 +211,11 @@ def part_to_write(
     size = state.unknowns.size
     products = state.code.new_zeros(shape[0], size + 1, size, dtype=torch.float64)
     cost, residual = products.new_empty(shape[0]), state.code.new_empty(shape)
-    first = state.unknowns.span(*term.sees).start
+    seen = state.unknowns.span(*term.sees)
     information = torch.zeros_like(products[:, :-1]) if own_information else products[:, :-1]
     part = Part(cost, products, information, residual, anchor)
     into = information if own_information else information[:, :0, :0]
-    return part, Sums(first, *map(array, (cost, products, into, residual)))
+    return part, Sums(seen.start, seen.stop - seen.start, *map(array, (cost, products, into, residual)))
 
 
 def linear_of(term: Term[AnchorT], prior: ShapePrior, field: Field, state: State, anchor: AnchorT) -> Linear[AnchorT]:
