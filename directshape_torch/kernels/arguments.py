@@ -105,9 +105,9 @@ class Contour(NamedTuple):
 class Columns(NamedTuple):
     """`Columns` are the first columns of the blocks of the tangent, as `state.unknowns` orders them."""
 
-    pose: int
-    code: int
-    offset: int
+    of_pose: int
+    of_code: int
+    of_offset: int
 
 
 class Sums(NamedTuple):

@@ -121,7 +121,7 @@ def write_values(family: Family, code: Reals, first: Index) -> None:
 def write_moved(rules: Rules, car: Index, move: Doubles, state: States, candidate: States) -> None:
     """Write the state after a step (`Unknowns.retract`)."""
     columns, T, moved = rules.columns, state.T_obj_cam[car], candidate.T_obj_cam[car]
-    of_pose = move[columns.pose :]
+    of_pose = move[columns.of_pose :]
     v, w = (of_pose[0], of_pose[1], of_pose[2]), (of_pose[3], of_pose[4], of_pose[5])
     angle_squared = dot(w, w)
     second, third = 0.0, 0.0
@@ -138,10 +138,10 @@ def write_moved(rules: Rules, car: Index, move: Doubles, state: States, candidat
         moved[0, column], moved[1, column], moved[2, column] = point
         moved[3, column] = T[3, column]
     for k in range(state.code.shape[1]):
-        code = state.code[car, k] + move[columns.code + k]
+        code = state.code[car, k] + move[columns.of_code + k]
         candidate.code[car, k] = min(max(code, -rules.max_code), rules.max_code)
     for k in range(state.offset_px.shape[1]):
-        candidate.offset_px[car, k] = state.offset_px[car, k] + move[columns.offset + k]
+        candidate.offset_px[car, k] = state.offset_px[car, k] + move[columns.of_offset + k]
 
 
 @loop

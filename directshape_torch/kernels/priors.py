@@ -23,18 +23,18 @@ def priors(terms: PriorArrays, columns: Columns, state: States, turn: Turn, out:
         for i in range(3):
             for k in range(4):
                 T[i, k] = state.T_obj_cam[car, i, k]
-        add_ground(terms, columns.pose, car, T, J, out)
+        add_ground(terms, columns.of_pose, car, T, J, out)
         if terms.pose_weight > 0:
-            add_pose(terms, columns.pose, car, T, J, out)
+            add_pose(terms, columns.of_pose, car, T, J, out)
         for k in range(num_codes):
             J[0] = 1.0
-            add(terms.shape_weight, np.float64(state.code[car, k]), J, 1, columns.code + k, car, out)
+            add(terms.shape_weight, np.float64(state.code[car, k]), J, 1, columns.of_code + k, car, out)
         if terms.dimensions_weight > 0:
-            add_dimensions(terms, columns.code, car, state.code[car], J, out)
+            add_dimensions(terms, columns.of_code, car, state.code[car], J, out)
         for k in range(num_offsets):
             sigma = np.float64(terms.offset_sigma_px[car, k])
             J[0] = 1.0 / sigma if sigma > 0 else 1.0
-            add(terms.rig_weight, state.offset_px[car, k] * J[0], J, 1, columns.offset + k, car, out)
+            add(terms.rig_weight, state.offset_px[car, k] * J[0], J, 1, columns.of_offset + k, car, out)
 
 
 @step
