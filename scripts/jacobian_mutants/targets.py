@@ -127,9 +127,7 @@ TARGETS: dict[str, Target] = {
         ("generators", "_higher_exp_coefficients", "exp", "from_rotation_translation"),
         _SE3_TESTS,
     ),
-    "se3_group": Target(
-        "directshape_torch/geometry/se3.py", ("inverse", "transform", "from_kornia", "to_kornia"), _SE3_TESTS
-    ),
+    "se3_group": Target("directshape_torch/geometry/se3.py", ("inverse", "transform"), _SE3_TESTS),
     "unknowns": Target(
         "directshape_torch/state/unknowns.py",
         ("Block.moved", "Unknowns.span", "Unknowns.placed", "Unknowns.retract", "Unknowns.derivative"),
