@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch import InputError, PCAShapePrior, ShapeFit, Status, fit_shape
-from directshape_torch.batch.scan_fits import fit_scan
+from directshape_torch.cli.fit_shape import fit_scan
 from directshape_torch.cli.main import main
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box_formats import boxes_to_poses, poses_to_boxes
@@ -167,7 +167,7 @@ def test_scans_of_a_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 def test_boxes_of_a_fitted_scan_are_those_of_its_result_lines(tmp_path: Path) -> None:
     root, boxes = scanned_dataset(tmp_path)
     dataset = open_dataset("kitti", root, boxes, frames=[3], lidar_dir=root / "velodyne")
-    fit = fit_scan(dataset, "000003", str(tmp_path / "out"))
+    fit = fit_scan(dataset, "000003", tmp_path / "out", PCAShapePrior.load_bundled())
     lines = read_objects(tmp_path / "out" / "data" / "000003.txt")[1:]
     written = torch.tensor([line.location_ref for line in lines])
     assert torch.allclose(fit.cars.boxes().location_ref.float(), written, atol=0.006)
@@ -180,4 +180,4 @@ def test_frames_need_their_scans(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert main([*words, "--out", str(tmp_path / "out")]) == 2
     assert "--lidar: expected a scan of frame 000003" in capsys.readouterr().err
     with pytest.raises(InputError, match="lidar_dir"):
-        fit_scan(open_dataset("kitti", root, boxes), "000003", tmp_path)
+        fit_scan(open_dataset("kitti", root, boxes), "000003", tmp_path, PCAShapePrior.load_bundled())
