@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TextIO
+from typing import Any
 
 from directshape_torch.batch.refine_dataset import package_version
 from directshape_torch.errors import DirectShapeError, PriorWarning
@@ -108,18 +108,11 @@ def _plain_warnings() -> Iterator[None]:
     with warnings.catch_warnings():
         otherwise = warnings.showwarning
 
-        def show(
-            message: Warning | str,
-            category: type[Warning],
-            filename: str,
-            lineno: int,
-            file: TextIO | None = None,
-            line: str | None = None,
-        ) -> None:
+        def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
             if issubclass(category, PriorWarning):
                 print(f"warning: {message}", file=sys.stderr)
             else:
-                otherwise(message, category, filename, lineno, file, line)
+                otherwise(message, category, *place, **more)
 
         warnings.showwarning = show
         yield

@@ -222,8 +222,7 @@ def _share_on(mask: InstanceMask, others: Sequence[InstanceMask]) -> float:
     covered = np.zeros_like(mask.inside)
     for other in others:
         if other.side == mask.side:
-            for place, theirs in _overlap((mask.corner, mask.inside), (other.corner, other.inside)):
-                covered[place] |= other.inside[theirs]
+            covered |= _covered((mask.corner, mask.inside), (other.corner, other.inside))
     return float((covered & mask.inside).sum() / mask.inside.sum())
 
 
@@ -252,24 +251,20 @@ def _fits(
     return fits
 
 
-def _overlap(a: _Pixels, b: _Pixels) -> list[tuple[tuple[slice, slice], tuple[slice, slice]]]:
-    """The common part of two crops, as slices of each; the list is empty if they do not overlap."""
-    (ua, va), (ub, vb) = a[0], b[0]
-    u0, v0 = max(ua, ub), max(va, vb)
-    u1, v1 = min(ua + a[1].shape[1], ub + b[1].shape[1]), min(va + a[1].shape[0], vb + b[1].shape[0])
-    if u1 <= u0 or v1 <= v0:
-        return []
-    return [
-        (
-            (slice(v0 - va, v1 - va), slice(u0 - ua, u1 - ua)),
-            (slice(v0 - vb, v1 - vb), slice(u0 - ub, u1 - ub)),
-        )
-    ]
+def _covered(a: _Pixels, b: _Pixels) -> NDArray[np.bool_]:
+    """Which places (h, w) of the crop a are pixels of the crop b."""
+    ((u, v), inside), ((u_b, v_b), others) = a, b
+    covered = np.zeros_like(inside)
+    u0, v0 = max(u, u_b), max(v, v_b)
+    u1, v1 = min(u + inside.shape[1], u_b + others.shape[1]), min(v + inside.shape[0], v_b + others.shape[0])
+    if u0 < u1 and v0 < v1:
+        covered[v0 - v : v1 - v, u0 - u : u1 - u] = others[v0 - v_b : v1 - v_b, u0 - u_b : u1 - u_b]
+    return covered
 
 
 def _common(a: _Pixels, b: _Pixels) -> int:
     """Number of pixels that are in both crops."""
-    return sum(int((a[1][of_a] & b[1][of_b]).sum()) for of_a, of_b in _overlap(a, b))
+    return int((a[1] & _covered(a, b)).sum())
 
 
 def mask_iou(a: InstanceMask, b: InstanceMask) -> float:

@@ -36,6 +36,16 @@ class StartNotReachedWarning(UserWarning):
     """The start of some problems has no gradient, because fewer steps are repeated than have led away from it."""
 
 
+_LOST_START = (
+    "the input states of problems {} have no gradient: more steps were taken than backward.unroll_iterations repeats"
+)
+_NOT_STATIONARY = (
+    "no implicit gradient for problems {}: their iterations ended away from a stationary point (iterate longer with a "
+    "smaller cost_tolerance; where they end on a kink of the energy, as on most real images, only unrolled iterations "
+    "have a gradient)"
+)
+
+
 def unrolled_state(
     problem: Problem[StateT, PreparedT, EvaluationT, FiguresT],
     start: StateT,
@@ -67,7 +77,7 @@ def unrolled_state(
     repeated = led_to_the_end & (from_the_end <= num_iterations)
     led_here = from_the_end[0] <= num_iterations
     if any(part.requires_grad for part in start):
-        _warn_of_lost_starts((rows if names is None else names)[~led_here].tolist())
+        _warn_of((rows if names is None else names)[~led_here], _LOST_START, StartNotReachedWarning)
     state = where_rows(led_here, start, _first_states(trajectory, repeated))
     begun, stage = -1, None
     for iteration, taken in zip(trajectory, repeated, strict=True):
@@ -144,7 +154,7 @@ def implicit_state(
     everyone = torch.ones_like(has_step)
     size = problem.sharing.largest(step_size(step.detach(), stage.step_limits().to(step)), everyone)
     stationary = has_step & (size <= max_remaining_step)  # a comparison with NaN is false
-    _warn_of_the_others(stationary, rows if names is None else names)
+    _warn_of((rows if names is None else names)[~stationary], _NOT_STATIONARY, NotStationaryWarning)
     step = torch.where(stationary[:, None], step, 0.0)
     return _with_values(state, stage.retract(state, step - step.detach()))
 
@@ -163,30 +173,11 @@ def _gradient_and_its_jacobian(
     return at, torch.stack(rows, dim=1)
 
 
-def _warn_of_lost_starts(others: Sequence[int]) -> None:
-    if others:
-        warnings.warn(
-            f"the input states of problems {_listed(others)} have no gradient: more steps were taken than "
-            "backward.unroll_iterations repeats",
-            StartNotReachedWarning,
-            stacklevel=2,
-        )
-
-
-def _warn_of_the_others(stationary: Tensor, names: Tensor) -> None:
-    others = names[~stationary].tolist()
-    if others:
-        warnings.warn(
-            f"no implicit gradient for problems {_listed(others)}: their iterations ended away from a stationary "
-            "point (iterate longer with a smaller cost_tolerance; where they end on a kink of the energy, as on most "
-            "real images, only unrolled iterations have a gradient)",
-            NotStationaryWarning,
-            stacklevel=2,
-        )
-
-
-def _listed(numbers: Sequence[int]) -> str:
-    return ", ".join(map(str, numbers[:10])) + (f" and {len(numbers) - 10} more" if len(numbers) > 10 else "")
+def _warn_of(numbers: Tensor, said: str, kind: type[UserWarning]) -> None:
+    """Warn of the problems with these numbers, if there are any; the text has a place for the numbers."""
+    if others := numbers.tolist():
+        more = f" and {len(others) - 10} more" if len(others) > 10 else ""
+        warnings.warn(said.format(", ".join(map(str, others[:10])) + more), kind, stacklevel=3)
 
 
 def _step(
