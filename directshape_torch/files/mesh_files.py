@@ -29,7 +29,7 @@ _MOST_PARTS = 2**14
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 
 
-def read_mesh(path: Path | str, cure: str = "") -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def read_mesh(path: Path | str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     r"""Vertices (V, 3) and triangles (F, 3) of an obj, ply, glb, off or stl file, all its parts in one.
 
     Raises:
@@ -47,7 +47,7 @@ def read_mesh(path: Path | str, cure: str = "") -> tuple[NDArray[np.float64], ND
 
     suffix = Path(path).suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        raise DataFormatError(path, f"is no {', '.join(MESH_SUFFIXES)} file", cure=cure or "convert it to one of them")
+        raise DataFormatError(path, f"is no {', '.join(MESH_SUFFIXES)} file", cure="convert it to one of them")
     content = read_bytes(path, _MOST_BYTES)
     try:
         _check_parts(content) if suffix == ".glb" else _check_lines(content)
@@ -56,11 +56,10 @@ def read_mesh(path: Path | str, cure: str = "") -> tuple[NDArray[np.float64], ND
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     # The loaders of the formats raise any error of their parsers.
     except Exception as problem:
-        said = f"cannot be read as a mesh ({type(problem).__name__}: {problem})"
-        raise DataFormatError(path, said, cure=cure) from problem
+        raise DataFormatError(path, f"cannot be read as a mesh ({type(problem).__name__}: {problem})") from problem
     fits = vertices.shape[1:] == faces.shape[1:] == (3,) and len(faces) > 0 and bool(np.isfinite(vertices).all())
     if not fits or faces.min() < 0 or faces.max() >= len(vertices):
-        raise DataFormatError(path, "holds no triangles with finite vertices", cure=cure)
+        raise DataFormatError(path, "holds no triangles with finite vertices")
     return vertices, faces
 
 

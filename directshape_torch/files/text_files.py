@@ -26,13 +26,13 @@ _MARKS = {
 _LINE_END = re.compile(r"\n|\r(?!\n)")
 
 
-def read_text(path: Path | str, most: int = _MOST_TEXT_BYTES, cure: str = "check the path") -> str:
+def read_text(path: Path | str, most: int = _MOST_TEXT_BYTES) -> str:
     """The content of a text file in UTF-8, or in UTF-16 or UTF-32 if it begins with their mark.
 
     PowerShell and Excel write such a mark, which is removed. Errors are those of `read_bytes`, and a `DataFormatError`
     for other content.
     """
-    content = read_bytes(path, most, cure)
+    content = read_bytes(path, most)
     encoding = next((encoding for mark, encoding in _MARKS.items() if content.startswith(mark)), "utf-8-sig")
     try:
         return content.decode(encoding)
