@@ -1,1 +1,0 @@
-"""This package counts outcomes of odd calls, damaged files, and killed and faulty runs (`scripts/fuzz.py`)."""
