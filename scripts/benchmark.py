@@ -1,7 +1,6 @@
 """This script measures times and numbers of operations of refinements (docs/performance.md).
 
     python scripts/benchmark.py                                  # times, operations, memory of whole calls
-    python scripts/benchmark.py --profile                        # one refinement, by part
     python scripts/benchmark.py --native                         # with native loops over without them
     python scripts/benchmark.py --set compile=on                 # with other settings over the defaults
     python scripts/benchmark.py --peers                          # PyPose's and Theseus's solvers over this library's
@@ -46,10 +45,6 @@ def run(args: argparse.Namespace) -> None:
     root = Path(data) if data else None
     print(machine(torch.device("cpu")), flush=True)
     rounds = 1 if args.quick else _ROUNDS
-    if args.profile:
-        from benchmark_suites.stage_profile import profile_rows
-
-        show(profile_rows(rounds))
     if args.against is not None:
         from benchmark_suites.checkouts import against_rows
 
@@ -66,7 +61,7 @@ def run(args: argparse.Namespace) -> None:
         from benchmark_suites.peers import peer_rows
 
         show(list(peer_rows(root, args.quick)))
-    if not (args.profile or args.native or args.set or args.peers or args.against):
+    if not (args.native or args.set or args.peers or args.against):
         scenes = load_scenes(root, 1 if args.quick else None)
         show([row for scene in scenes for row in time_rows(scene, rounds, args.quick)])
 
@@ -96,7 +91,6 @@ def machine(device: torch.device) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line and run; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--profile", action="store_true", help="time and operations of one refinement by part")
     parser.add_argument("--native", action="store_true", help="with native loops over without them, in turn")
     parser.add_argument("--set", nargs="+", metavar="KEY=VALUE", help="with these settings over the defaults, in turn")
     parser.add_argument(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,37 +11,21 @@ from torch.utils._python_dispatch import TorchDispatchMode
 _MEMORY_EVENT = "[memory]"
 
 
-class OperationCount(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """An `OperationCount` counts operations by name on the level of PyTorch's kernels: views count, wrappers do not.
+class _OperationCount(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """An `_OperationCount` counts on the level of PyTorch's kernels: views count, wrappers do not."""
 
-    Functions that would be compiled run in their plain form inside.
-
-    Examples:
-        >>> with OperationCount() as count:
-        ...     _ = torch.ones(3) + 1
-        >>> count.by_name
-        Counter({'aten.ones': 1, 'aten.add': 1})
-    """
-
-    def __init__(self) -> None:
-        super().__init__()  # type: ignore[no-untyped-call]
-        self.by_name: Counter[str] = Counter()
-
-    @property
-    def total(self) -> int:
-        return sum(self.by_name.values())
+    total = 0
 
     def __torch_dispatch__(
         self, func: Any, types: Sequence[type], args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
-        self.by_name[str(func.overloadpacket)] += 1
+        self.total += 1
         return func(*args, **(kwargs or {}))
 
 
 def count_operations(call: Callable[[], object]) -> int:
     """Number of operations of a call. The time of eager calls of few cars is mostly the launch of operations."""
-    count = OperationCount()
-    with count:
+    with _OperationCount() as count:  # type: ignore[no-untyped-call]
         call()
     return count.total
 
