@@ -31,4 +31,5 @@ def run_command(
 
 def markdown_table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> str:
     """Lines of a table in Markdown from its head and its rows, without a line end."""
-    return "\n".join("| " + " | ".join(map(str, row)) + " |" for row in (head, ["---"] * len(head), *rows))
+    first, *rest = ("| " + " | ".join(map(str, row)) + " |" for row in (head, *rows))
+    return "\n".join([first, "|" + "---|" * len(head), *rest])
