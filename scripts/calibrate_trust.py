@@ -8,7 +8,6 @@ A run learns the errors of its detector from its own results, never from labels.
 and, together with boxes and masks on unrelated images, when a car is there; all draws have the same weight. If all runs
 have other roots (by the names of their folders) with other detectors, each run is judged by a model that was fitted to
 these. Cars that the package refuses for lack of evidence are excluded.
-Boxes with the mask of their neighbour in the image are judged, too, but nothing is fitted to them.
 
 The draws, `report.md` and `trust_model.json`, fitted to all runs, are written to OUT.
 """
@@ -66,8 +65,8 @@ def runs_of(args: argparse.Namespace) -> list[Cars]:
 
 def _refined(run: tuple[Path, Path, Path, str, bool], overrides: Sequence[str], by_frame: bool) -> bytes:
     """Pickled cars of a run; as single tensors each would need an open file to cross processes."""
-    root, detections, masks, name, with_wrong = run
-    found = refined_cars(root, detections, masks, name, overrides, with_wrong and not by_frame, by_frame)
+    root, detections, masks, name, is_first = run
+    found = refined_cars(root, detections, masks, name, overrides, is_first and not by_frame, by_frame)
     count = sum(len(frame.result) for frame in found.frames)
     print(f"{root.name} {detections.name}: {count} cars", file=sys.stderr, flush=True)
     return pickle.dumps(found)
@@ -124,7 +123,6 @@ class JudgedRow(NamedTuple):
 
     cars: list[Judged]
     elsewhere: list[Judged]
-    swapped: list[Judged]
     model: TrustModel
 
     def returned(self, cars: list[Judged], limits: AcceptanceConfig) -> list[NDArray[np.bool_]]:
@@ -144,14 +142,12 @@ Rows: TypeAlias = Mapping[tuple[str, str], JudgedRow]
 def _judged(runs: Sequence[Cars], row: tuple[str, str], model: TrustModel) -> JudgedRow:
     some, noise = [run for run in runs if (run.root, run.detector) == row], model.image_noise
     elsewhere = [run.judged(noise, run.elsewhere) for run in some if run.elsewhere]
-    swapped = [run.judged(noise, run.swapped) for run in some if run.swapped]
-    return JudgedRow([run.judged(noise, run.frames) for run in some], elsewhere, swapped, model)
+    return JudgedRow([run.judged(noise, run.frames) for run in some], elsewhere, model)
 
 
 def _policies(rows: Rows, limits: AcceptanceConfig) -> str:
     """Table of returned boxes, a row for each detector and root: means over draws with standard deviations."""
     head = "cars", "runs, cars", "input", "images alone (worse)", "most probable (worse)", "returned (worse, share)"
-    wrong = "returned on other images", "returned worse with a neighbour's mask"
     lines = []
     for (root, detector), row in rows.items():
         cars, share = row.cars, np.mean([kept.mean() for kept in row.returned(row.cars, limits)])
@@ -159,11 +155,10 @@ def _policies(rows: Rows, limits: AcceptanceConfig) -> str:
         cells = [_cell(cars, [each.images for each in cars]), _cell(cars, [each.after for each in cars])]
         cells.append(f"{_cell(cars, row.chosen(row.cars, limits))[:-1]}, {share:.0%})")
         there = row.returned(row.elsewhere, limits)
-        pairs = zip(row.chosen(row.swapped, limits), row.swapped, strict=True)
-        cells += [_count(there), _count([after < each.before - WORSE_BY for after, each in pairs])]
+        cells.append(f"{sum(each.sum() for each in there)} of {sum(map(len, there))}" if there else "")
         counts = f"{len(cars)}, {np.mean([len(each.before) for each in cars]):.0f}"
         lines.append([f"{root} {detector}", counts, inputs, *cells])
-    return markdown_table((*head, *wrong), lines)
+    return markdown_table((*head, "returned on other images"), lines)
 
 
 def _by_one_root(runs: Sequence[Cars], rows: Rows, limits: AcceptanceConfig) -> str:
@@ -181,10 +176,6 @@ def _by_one_root(runs: Sequence[Cars], rows: Rows, limits: AcceptanceConfig) -> 
 
 def _returned(row: JudgedRow, limits: AcceptanceConfig) -> str:
     return _cell(row.cars, row.chosen(row.cars, limits), with_spread=False)
-
-
-def _count(flags: Sequence[NDArray[np.bool_]]) -> str:
-    return f"{sum(each.sum() for each in flags)} of {sum(map(len, flags))}" if flags else ""
 
 
 def _thresholds(rows: Rows, limits: AcceptanceConfig) -> str:
