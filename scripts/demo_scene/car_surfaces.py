@@ -27,9 +27,9 @@ class CarModel:
     normals: Array
 
 
-def car_model(car: PlacedCar, spacing_m: float = 0.03) -> CarModel:
+def car_model(car: PlacedCar) -> CarModel:
     """The mesh of a car, before it is cut into parts."""
-    mesh = cars.car_mesh(car.parameters, spacing_m)
+    mesh = cars.car_mesh(car.parameters)
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     return CarModel(vertices, faces, np.asarray(mesh.vertex_normals, np.float64))
 

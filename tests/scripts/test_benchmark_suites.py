@@ -10,8 +10,7 @@ import benchmark
 import pytest
 import torch
 from benchmark_suites import checkouts, in_turn, workloads
-from benchmark_suites.measures import count_operations, peak_tensor_bytes
-from benchmark_suites.timing import Row, Spread, time_interleaved
+from benchmark_suites.measures import Row, Spread, count_operations, peak_tensor_bytes, time_interleaved
 from helpers.car_counts import first_cars
 
 
