@@ -4,11 +4,11 @@
     python scripts/reproduce_tables.py pose --data $R --detections $R/detections/stereo --masks $R/training/masks
     python scripts/reproduce_tables.py ablation --data $R --detections $R/detections/stereo --masks $R/training/masks
 
-A row is a call of `directshape refine` with the words beside its name below, in its own folder under --out. A second
-call only makes the table, and an interrupted call continues. Other data, detections or masks need another --out. A
-difference is the mean change of BEV IoU from the table's first row, of the same cars, with its 95 % interval over cars.
-Every row of the ablation but one is refined from the images alone, so that a difference shows what a term does and not
-how well the detector makes up for it.
+A row is a call of `directshape refine` with the words beside its name below, or of `align_boxes.py`, in its own folder
+under --out. A second call only makes the table, and an interrupted call continues. Other data, detections or masks need
+another --out. A difference is the mean change of BEV IoU from the table's first row, of the same cars, with its 95 %
+interval over cars. Every row of the ablation but one is refined from the images alone, so that a difference shows what
+a term does and not how well the detector makes up for it.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import align_boxes
 import numpy as np
 from command_line import markdown_table, run_command
 
@@ -29,8 +30,10 @@ from directshape_torch.evaluation.bootstrap import CarBootstrap
 from directshape_torch.evaluation.comparison import Comparison, compare_results
 from directshape_torch.evaluation.kitti_ap import evaluate_kitti
 from directshape_torch.evaluation.tables import number, with_interval
+from directshape_torch.rig.rig_file import RIG_FILE
 
 IMAGES_ALONE = "images alone"
+BOX_ALIGNMENT = "box alignment"
 METHODS = {
     "default": "",
     "input where not trusted": "--trusted",
@@ -39,6 +42,7 @@ METHODS = {
     "fast": "--config fast",
     "geometric": "--config geometric",
     "combined": "--config combined",
+    BOX_ALIGNMENT: "align_boxes.py",
 }
 _COARSE = "{contour_width_px: 2.0, image_level: 1, max_iterations: 6, over_relaxation: 1.6, unknowns: pose}"
 _FINE = "{contour_width_px: 0.5, image_level: 0, max_iterations: 6, over_relaxation: 1.6, unknowns: pose}"
@@ -104,7 +108,11 @@ def refined(args: argparse.Namespace, name: str) -> Path:
     data = ["--data", args.data, "--detections", args.detections, "--masks", args.masks, "--out", out]
     words = [*map(str, data), *([] if args.frames is None else ["--frames", *args.frames])]
     with contextlib.redirect_stdout(sys.stderr):
-        code = directshape(["refine", *words, *words_of(rows[name])])
+        if name == BOX_ALIGNMENT:
+            # The rig is the one that the first row has estimated from the same frames.
+            code = align_boxes.main([*words, "--rig", str(folder_of(args, first_row(args)) / RIG_FILE)])
+        else:
+            code = directshape(["refine", *words, *words_of(rows[name])])
     if code:
         raise DirectShapeError(f"the row {name!r} could not be refined, see above")
     return out

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from align_boxes import move_by_disparity
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import CONFIGS, DEFAULT, begun_stage, figures_at, photometric_of
 from helpers.synthetic_scene import CAMERA_HEIGHT_M, Street, cached_street, disturbed, masked, select, street
@@ -16,7 +17,6 @@ from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import InputError
-from directshape_torch.geometry import se3
 from directshape_torch.refinement.disparity_profile import (
     DisparityProfile,
     disparity_profile,
@@ -73,10 +73,8 @@ def test_the_minimum_is_where_the_right_image_was_moved_to(shift_px: int) -> Non
 def test_a_car_that_begins_too_far_away_is_pulled_nearer() -> None:
     scene = far_street()
     stage, truth = begun(scene.frames, scene)
-    T_cam_obj = se3.inverse(truth.T_obj_cam)
-    disparity = 2200 * 0.53 / T_cam_obj[:, 2, 3]
-    T_cam_obj[:, :3, 3] *= (disparity / (disparity - 1.5))[:, None]
-    start = truth._replace(T_obj_cam=se3.inverse(T_cam_obj))
+    focal_baseline = torch.full((2,), 2200 * 0.53, dtype=torch.float64)
+    start = move_by_disparity(truth, focal_baseline, -1.5)
     found = profile_at(stage, start, truth)
     torch.testing.assert_close(found.before.offset_px, torch.full((2,), 1.5).double(), atol=0.15, rtol=0)
     torch.testing.assert_close(found.after.offset_px, torch.zeros(2).double(), atol=0.05, rtol=0)

@@ -15,7 +15,7 @@ from directshape_torch.refiner import DirectShapeRefiner
 
 @pytest.mark.parametrize("table", sorted(script.TABLES))
 def test_every_row_is_a_call_that_changes_something(table: str) -> None:
-    rows = script.TABLES[table]
+    rows = {name: row for name, row in script.TABLES[table].items() if name != script.BOX_ALIGNMENT}
     words = {name: script.words_of(row) for name, row in rows.items()}
     assert len({tuple(w) for w in words.values()}) == len(rows)
     needed = ["refine", "--data", "d", "--detections", "d", "--out", "o"]
@@ -51,8 +51,8 @@ def test_a_table_and_that_its_runs_are_kept(
         patched.setattr(DirectShapeRefiner, "forward", refuse)
         assert script.main([*words, "--rows", "silhouette only"]) == 0
     assert (tmp_path / "out" / "ablation.md").read_text() == table
-    assert script.main(["pose", *words[1:], "--rows", "default"]) == 0
-    assert (tmp_path / "out" / "default" / "data" / "000000.txt").is_file()
-    assert "| default | " in (tmp_path / "out" / "pose.md").read_text()
+    assert script.main(["pose", *words[1:], "--rows", script.BOX_ALIGNMENT]) == 0
+    assert (tmp_path / "out" / "box_alignment" / "data" / "000000.txt").is_file()
+    assert f"| {script.BOX_ALIGNMENT} | " in (tmp_path / "out" / "pose.md").read_text()
     assert script.main([*words, "--rows", "nothing"]) == 2
     assert "silhouette only" in capsys.readouterr().err
