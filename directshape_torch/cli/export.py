@@ -1,8 +1,8 @@
 """`directshape export`: a finished run for other programs.
 
 Write the finished frames of an output folder of 'directshape refine' for other programs: surfaces as GLB or PLY,
-coloured by the left image, or with boxes as a recording for Rerun's viewer. Boxes as KITTI files are in OUT/data. OUT
-itself is only read. docs/outputs.md gives the coordinate frame of each file.
+coloured by the left image; boxes as KITTI files; and both as a recording for Rerun's viewer. OUT itself is only read.
+docs/outputs.md gives the coordinate frame of each file.
 """
 
 from __future__ import annotations

@@ -24,14 +24,14 @@ def test_writes_the_formats_and_only_reads_the_run(
     finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = contents(finished.out)
-    formats = ("--format", "glb", "ply", "--frames", "1")
+    formats = ("--format", "glb", "kitti", "--frames", "1")
     data = ("--data", finished.root, "--masks", finished.root / "masks")
     assert main(command(finished, tmp_path, *formats, *data)) == 0
-    assert capsys.readouterr().out == f"exported  1 frames as glb, ply to {tmp_path}\n"
+    assert capsys.readouterr().out == f"exported  1 frames as glb, kitti to {tmp_path}\n"
     assert sorted(contents(tmp_path)) == [
         "glb/000001.glb",
-        "ply/000001_1.ply",
-        "ply/000001_3.ply",
+        "kitti/data/000001.txt",
+        "kitti/json/000001.json",
     ]
     assert contents(finished.out) == before
 

@@ -90,7 +90,7 @@ def test_a_run_goes_on_and_is_not_one_with_boxes(
 def test_all_that_reads_a_run_reads_this_one(run: Path, masks: Path, tmp_path: Path) -> None:
     out = Path(shutil.copytree(run, tmp_path / "run"))
     assert main(["report", str(out), *inputs(masks)]) == 0
-    exported = ["--format", "ply", "--out", str(tmp_path / "exported")]
+    exported = ["--format", "ply", "kitti", "--out", str(tmp_path / "exported")]
     assert main(["export", str(out), *exported, *inputs(masks)]) == 0
     assert main(["status", str(out)]) == 0
 

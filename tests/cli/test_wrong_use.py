@@ -25,7 +25,7 @@ CASES = [
     (f"{EXPORT} --format ply --masks-left x", "because of --masks-left"),
     (f"{EXPORT} --format ply --frames 7", "frames: expected finished frames of"),
     (f"{EXPORT} --format ply --prior pca", "--prior: expected the prior of the run"),
-    ("export {root} --format glb --out {out}", "summary.json: is missing"),
+    ("export {root} --format kitti --out {out}", "summary.json: is missing"),
     (f"{REPORT} --frames 1 9", "got 9"),
     (f"{REPORT} --max-frames -1", "most_frames"),
     (f"{REPORT} --detections .", "--data"),

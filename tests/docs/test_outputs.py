@@ -61,4 +61,4 @@ def test_the_python_example_runs(finished: FinishedRun, tmp_path: Path) -> None:
     names: dict[str, object] = {}
     exec(code, names)
     assert (tmp_path / "glb" / "000001.glb").is_file()
-    assert (tmp_path / "ply" / "000001_1.ply").is_file()
+    assert (tmp_path / "kitti" / "json" / "000001.json").is_file()

@@ -126,7 +126,7 @@ def commands(root: Path, out: Path) -> None:
         ["check-data", *data, "--frames", "000000"],
         ["status", str(out / "out")],
         ["report", str(out / "out"), "--html", str(out / "page.html"), *with_prior],
-        ["export", str(out / "out"), "--out", str(out / "exports"), "--format", "glb", *with_prior],
+        ["export", str(out / "out"), "--out", str(out / "exports"), "--format", "glb", "kitti", *with_prior],
         ["compare", "--labels", labels, "--before", str(root / "detections"), "--after", results, "--frames", "0"],
         ["evaluate", "--labels", labels, "--results", str(root / "detections")],
         ["calibrate-rig", *data, "--out", str(out / "rig.json")],
