@@ -1,11 +1,13 @@
 """This script renders stereo frames of a street with parametric cars, in KITTI's layout, with exact ground truth.
 
     pip install 'directshape_torch[render]'
-    python scripts/render_demo_scene.py --out DIR --frames N --seed S
+    python scripts/render_demo_scene.py --out DIR --frames N --seed S [--sequence SECONDS]
 
 Frame k has seed S + k and contains left and right images (1242 x 375), calibration, labels, ground plane, exact
 instance masks (COCO RLE), a description of the scene (`meta`: exact poses and measures), and noisy detections as of a
-stereo detector.
+stereo detector. With `--sequence` the frames are of one moving scene (passing parked cars, turning, overtaking or
+pulling out, depending on the seed), in the layout of KITTI's tracking benchmark, with tracks, times and the camera's
+motion.
 
 Equal seeds give equal scenes; the pixels are equal with the same renderer version and variant. A frame takes minutes (6
 with `--cars 4 --paths-per-pixel 1` on two busy cores). The script needs Mitsuba 3 and pyoidn.
@@ -21,9 +23,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from command_line import run_command
-from demo_scene.frame import RenderSettings, render_frame
-from demo_scene.frame_files import write_frame
+from demo_scene.frame import RenderSettings, render_frame, render_sequence
+from demo_scene.frame_files import write_frame, write_sequence
 from demo_scene.layout import sample_layout
+from demo_scene.motion import sample_sequence
 from demo_scene.rendering import import_mitsuba
 
 
@@ -32,6 +35,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder that gets training/ and detections/")
     parser.add_argument("--frames", type=int, default=1, help="number of frames (default 1)")
+    parser.add_argument(
+        "--sequence", type=float, metavar="SECONDS", help="one moving scene, a frame every so many seconds"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of the first frame (default 0)")
     parser.add_argument("--cars", type=int, choices=(4, 5, 6), default=None, help="cars a frame (default: 4 to 6)")
     parser.add_argument("--paths-per-pixel", type=int, default=16, help="samples of the path tracer (default 16)")
@@ -47,6 +53,10 @@ def run(options: argparse.Namespace) -> None:
     """
     import_mitsuba()
     settings = RenderSettings(options.paths_per_pixel, options.variant)
+    if options.sequence is not None:
+        layouts = sample_sequence(options.seed, options.frames, options.sequence)
+        write_sequence(options.out, f"{options.seed:04d}", list(render_sequence(layouts, settings)), options.sequence)
+        return
     for k in range(options.frames):
         started = time.perf_counter()
         frame = render_frame(sample_layout(options.seed + k, options.cars), settings)

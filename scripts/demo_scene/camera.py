@@ -45,6 +45,9 @@ class CameraPose:
     height_m: float
     pitch_rad: float
     roll_rad: float
+    x_m: float = 0.0  # position on the road, metres
+    z_m: float = 0.0
+    yaw_rad: float = 0.0  # 0 along the street, positive to the right
 
     @property
     def T_cam_road(self) -> Array:
@@ -53,9 +56,11 @@ class CameraPose:
         R_pitch = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
         c, s = np.cos(self.roll_rad), np.sin(self.roll_rad)
         R_roll = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        R_yaw = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
         T = np.eye(4)
-        T[:3, :3] = R_roll @ R_pitch
-        T[:3, 3] = T[:3, :3] @ np.array([0.0, self.height_m, 0.0])
+        T[:3, :3] = R_roll @ R_pitch @ R_yaw
+        T[:3, 3] = T[:3, :3] @ np.array([-self.x_m, self.height_m, -self.z_m])
         return T
 
     @property

@@ -1,8 +1,8 @@
-"""This module renders a frame from a seed: layout, surfaces, both views, exact masks, labels and detections."""
+"""This module renders frames from a seed: layout, surfaces, both views, exact masks, labels and detections."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -38,17 +38,24 @@ class RenderSettings:
 
 def render_frame(layout: SceneLayout, settings: RenderSettings) -> Frame:
     """Render a scene, with all randomness from `layout.seed`."""
-    rngs = dict(zip(("street", "sky", "sensor", "detector"), _generators(layout.seed, 4), strict=True))
-    meshes = [car_mesh(car.parameters) for car in layout.cars]
-    car_parts = [car_surfaces(c, m, k) for k, (c, m) in enumerate(zip(layout.cars, meshes, strict=True))]
-    surfaces = street(rngs["street"]) + [surface for parts in car_parts for surface in parts]
-    renderer = Renderer(surfaces, scene_light(rngs["sky"], layout), settings.variant)
-    left, right = _pictures(renderer, layout, rngs["sensor"], settings)
-    truth = Renderer(surfaces, None, settings.variant)
-    truth_left, truth_right = (truth.pixel_truth(view) for view in _views(layout))
-    labels = _labels(layout, meshes, car_parts, truth_left, settings.variant)
-    detections = {k: noisy_detection(rngs["detector"], label) for k, label in labels.items()}
-    return Frame(layout, left, right, truth_left.instance, truth_right.instance, labels, detections)
+    return next(render_sequence([layout], settings))
+
+
+def render_sequence(layouts: Sequence[SceneLayout], settings: RenderSettings) -> Iterator[Frame]:
+    """Render one scene at several times; the street and the cars' surfaces are made once."""
+    first = layouts[0]
+    rngs = dict(zip(("street", "sky", "sensor", "detector"), _generators(first.seed, 4), strict=True))
+    still, light = street(rngs["street"]), scene_light(rngs["sky"], first)
+    meshes = [car_mesh(car.parameters) for car in first.cars]
+    for number, layout in enumerate(layouts):
+        car_parts = [car_surfaces(c, m, k) for k, (c, m) in enumerate(zip(layout.cars, meshes, strict=True))]
+        surfaces = still + [surface for parts in car_parts for surface in parts]
+        left, right = _pictures(Renderer(surfaces, light, settings.variant), layout, number, rngs["sensor"], settings)
+        truth = Renderer(surfaces, None, settings.variant)
+        truth_left, truth_right = (truth.pixel_truth(view) for view in _views(layout))
+        labels = _labels(layout, meshes, car_parts, truth_left, settings.variant)
+        detections = {k: noisy_detection(rngs["detector"], label) for k, label in labels.items()}
+        yield Frame(layout, left, right, truth_left.instance, truth_right.instance, labels, detections)
 
 
 def _views(layout: SceneLayout) -> tuple[Array, Array]:
@@ -56,10 +63,11 @@ def _views(layout: SceneLayout) -> tuple[Array, Array]:
 
 
 def _pictures(
-    renderer: Renderer, layout: SceneLayout, rng: np.random.Generator, settings: RenderSettings
+    renderer: Renderer, layout: SceneLayout, number: int, rng: np.random.Generator, settings: RenderSettings
 ) -> tuple[Picture, Picture]:
+    seed = 2 * (layout.seed + number)
     radiance = [
-        sensor.denoise(renderer.path_trace(view, settings.paths_per_pixel, 2 * layout.seed + k))
+        sensor.denoise(renderer.path_trace(view, settings.paths_per_pixel, seed + k))
         for k, view in enumerate(_views(layout))
     ]
     exposure = sensor.exposure_for(radiance[0])

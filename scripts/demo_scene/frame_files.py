@@ -1,8 +1,9 @@
-"""This module writes frames in the folder layout of KITTI's object benchmark."""
+"""This module writes frames in the folder layouts of KITTI's object and tracking benchmarks."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from demo_scene.camera import CameraPose, projection
+from demo_scene.camera import T_CAM_REF, CameraPose, projection
 from demo_scene.labels import CarLabel, label_line, result_line
 from demo_scene.layout import SceneLayout
 from demo_scene.surfaces import Indices, Picture
@@ -34,17 +35,52 @@ class Frame:
 
 def write_frame(root: Path, name: str, frame: Frame) -> None:
     """Write images, calibration, labels, plane, masks, detections and the scene's description under `root`."""
+    _write_views(root, ("image_2", "image_3"), name, frame, {})
     training = root / "training"
-    for folder, image in (("image_2", frame.image_left), ("image_3", frame.image_right)):
-        _write_png(training / folder / f"{name}.png", image)
-    write_text(training / "planes" / f"{name}.txt", plane_text(frame.layout.camera))
-    masks = mask_entries(frame.instance_left, "left") + mask_entries(frame.instance_right, "right")
-    write_text(training / "masks" / f"{name}.json", json.dumps(masks))
-    write_text(training / "meta" / f"{name}.json", json.dumps(scene_description(frame.layout), indent=1) + "\n")
     write_text(training / "calib" / f"{name}.txt", calibration_text())
     write_text(training / "label_2" / f"{name}.txt", "".join(label_line(x) + "\n" for x in frame.labels.values()))
     detections = root / "detections" / "noisy_stereo" / "data" / f"{name}.txt"
     write_text(detections, "".join(result_line(x, 0.9) + "\n" for x in frame.detections.values()))
+
+
+def write_sequence(root: Path, name: str, frames: Sequence[Frame], interval_s: float) -> None:
+    """Write frames of one scene in the layout of KITTI's tracking benchmark; a car's number is its track.
+
+    Further files are `poses/NAME.txt` (poses of camera 0 relative to the first frame, rows of 12 as in KITTI's odometry
+    benchmark) and `times/NAME.txt` (seconds).
+    """
+    training = root / "training"
+    for number, frame in enumerate(frames):
+        when = {"time_s": number * interval_s}
+        _write_views(root, ("image_02", "image_03"), f"{name}/{number:06d}", frame, when)
+    lines = [(f"{n} {k}", frame.labels[k], frame.detections[k]) for n, frame in enumerate(frames) for k in frame.labels]
+    write_text(training / "calib" / f"{name}.txt", calibration_text())
+    write_text(training / "poses" / f"{name}.txt", "".join(pose_lines([f.layout.camera for f in frames])))
+    times = "".join(f"{number * interval_s:.3f}\n" for number in range(len(frames)))
+    write_text(training / "times" / f"{name}.txt", times)
+    write_text(training / "label_02" / f"{name}.txt", "".join(f"{n} {label_line(x)}\n" for n, x, _ in lines))
+    found = "".join(f"{n} {result_line(x, 0.9)}\n" for n, _, x in lines)
+    write_text(root / "detections" / "noisy_stereo" / f"{name}.txt", found)
+
+
+def _write_views(root: Path, folders: tuple[str, str], stem: str, frame: Frame, when: dict[str, Any]) -> None:
+    """Write the files of a frame that both layouts have: images, plane, masks and description."""
+    training = root / "training"
+    for folder, image in zip(folders, (frame.image_left, frame.image_right), strict=True):
+        _write_png(training / folder / f"{stem}.png", image)
+    write_text(training / "planes" / f"{stem}.txt", plane_text(frame.layout.camera))
+    masks = mask_entries(frame.instance_left, "left") + mask_entries(frame.instance_right, "right")
+    write_text(training / "masks" / f"{stem}.json", json.dumps(masks))
+    description = json.dumps({**when, **scene_description(frame.layout)}, indent=1)
+    write_text(training / "meta" / f"{stem}.json", description + "\n")
+
+
+def pose_lines(cameras: Sequence[CameraPose]) -> list[str]:
+    """Rows of 12 numbers of `T_first_ref` for each camera 0."""
+    T_ref_cam = np.eye(4)
+    T_ref_cam[:3, 3] = -T_CAM_REF
+    T_ref_road = [T_ref_cam @ camera.T_cam_road for camera in cameras]
+    return [_numbers((T_ref_road[0] @ np.linalg.inv(T))[:3].ravel()) + "\n" for T in T_ref_road]
 
 
 def calibration_text() -> str:

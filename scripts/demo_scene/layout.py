@@ -69,21 +69,29 @@ def sample_layout(seed: int, num_cars: int | None = None) -> SceneLayout:
     """Draw a scene of 4 to 6 cars, at least one partly and none nearly hidden; equal seeds give equal scenes."""
     rng = np.random.default_rng(seed)
     count = int(rng.integers(4, 7)) if num_cars is None else num_cars
-    # KITTI's camera gets a small random pitch and roll.
-    camera = CameraPose(
+    camera = draw_camera(rng)
+    while True:
+        poses = _draw_poses(rng, count)
+        cars = tuple(dress(rng, pose) for pose in poses)
+        shares = visible_column_shares(camera, cars)
+        if shares.min() > 0.45 and 0.45 < np.sort(shares)[0] < 0.85:
+            break
+    return SceneLayout(seed, camera, cars, *draw_sun(rng))
+
+
+def draw_camera(rng: np.random.Generator) -> CameraPose:
+    """KITTI's camera with a small random pitch and roll."""
+    return CameraPose(
         height_m=float(rng.normal(1.65, 0.02)),
         pitch_rad=float(np.radians(rng.normal(0.4, 0.3))),
         roll_rad=float(np.radians(rng.normal(0.0, 0.3))),
     )
-    while True:
-        poses = _draw_poses(rng, count)
-        cars = tuple(_dressed(rng, pose) for pose in poses)
-        shares = visible_column_shares(camera, cars)
-        if shares.min() > 0.45 and 0.45 < np.sort(shares)[0] < 0.85:
-            break
+
+
+def draw_sun(rng: np.random.Generator) -> tuple[float, float]:
+    """Random elevation and azimuth in radians."""
     elevation = float(np.radians(rng.uniform(36.0, 55.0)))
-    azimuth = float(np.radians(rng.uniform(110.0, 160.0) * rng.choice([-1.0, 1.0])))
-    return SceneLayout(seed, camera, cars, elevation, azimuth)
+    return elevation, float(np.radians(rng.uniform(110.0, 160.0) * rng.choice([-1.0, 1.0])))
 
 
 def _draw_poses(rng: np.random.Generator, count: int) -> list[Array]:
@@ -105,7 +113,7 @@ def _draw_poses(rng: np.random.Generator, count: int) -> list[Array]:
     return poses
 
 
-def _dressed(rng: np.random.Generator, T_road_obj: Array) -> PlacedCar:
+def dress(rng: np.random.Generator, T_road_obj: Array) -> PlacedCar:
     """A random car of the traffic, at this pose."""
     parameters = sample_car(rng, str(rng.choice(_BODY_TYPES, p=_BODY_TYPE_SHARES)))
     paint, metallic = _PAINTS[int(rng.integers(len(_PAINTS)))]

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 import render_demo_scene
 import torch
-from demo_scene import camera, labels, layout, surfaces
+from demo_scene import camera, frame_files, labels, layout, motion, surfaces
 
 from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.io.layouts import tracking_layout
 
 # pycocotools' decode predates numpy 2's protocol.
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
@@ -64,6 +65,47 @@ def test_label_of_a_known_box(scene: layout.SceneLayout) -> None:
     # The nearest face is at z = 8.1: it bounds the box at the right and below.
     assert label.box_2d[2] == pytest.approx(609.5593 + 721.5377 * 2.9 / 8.1)
     assert label.box_2d[3] == pytest.approx(172.854 + 721.5377 * 1.65 / 8.1)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_cars_of_a_sequence_keep_their_shape_and_move(seed: int) -> None:
+    layouts = motion.sample_sequence(seed, 8, 0.3)
+    assert {tuple(car.parameters for car in each.cars) for each in layouts} == {
+        tuple(car.parameters for car in layouts[0].cars)
+    }
+    assert layouts[-1].camera.z_m > layouts[0].camera.z_m + 1.0
+    turned = [abs(_heading(layouts[-1].cars[k]) - _heading(layouts[0].cars[k])) for k in range(4)]
+    moved = [
+        np.linalg.norm(layouts[-1].cars[k].T_road_obj[:3, 3] - layouts[0].cars[k].T_road_obj[:3, 3]) for k in (0, 1)
+    ]
+    assert max(moved) > 5.0
+    # Kinds 1 and 3 of the traffic turn.
+    assert (max(turned) > 1.0) == (seed in (1, 3))
+
+
+def _heading(car: layout.PlacedCar) -> float:
+    return float(np.arctan2(-car.T_road_obj[2, 0], car.T_road_obj[0, 0]))
+
+
+def test_a_sequence_has_the_files_of_the_tracking_benchmark(tmp_path: Path) -> None:
+    blank, nothing = np.zeros((4, 6, 3), np.uint8), np.full((4, 6), -1)
+    label = labels.CarLabel(0.0, 0, (1.0, 2.0, 3.0, 4.0), (1.5, 1.6, 3.9), (-1.0, 1.6, 10.0), 1.57)
+    layouts = motion.sample_sequence(1, 2, 0.3)
+    frames = [
+        frame_files.Frame(each, blank, blank, nothing, nothing, {2: label, 5: label}, {2: label, 5: label})
+        for each in layouts
+    ]
+    frame_files.write_sequence(tmp_path, "0001", frames, 0.3)
+    found = tracking_layout(tmp_path, tmp_path / "detections" / "noisy_stereo")
+    assert found.frame_ids() == ["0001_000000", "0001_000001"]
+    assert [line.score for line in found.files("0001_000001").read_objects()] == [0.9, 0.9]
+    assert len(found.files("0001_000001").read_labels() or []) == 2
+    # `poses` leads from a frame's camera 0 to the first one's: the road's origin must arrive where it was.
+    T_first_second = np.vstack(
+        [np.loadtxt(tmp_path / "training" / "poses" / "0001.txt")[1].reshape(3, 4), [0, 0, 0, 1]]
+    )
+    origin = [camera.transform(each.camera.T_cam_road, np.zeros((1, 3))) - camera.T_CAM_REF for each in layouts]
+    np.testing.assert_allclose(camera.transform(T_first_second, origin[1]), origin[0], atol=1e-9)
 
 
 def test_bundled_labels_are_those_of_the_seed(scene: layout.SceneLayout) -> None:
