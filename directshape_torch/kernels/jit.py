@@ -28,7 +28,7 @@ SOURCES = zlib.crc32(b"".join(path.read_bytes() for path in _FILES))
 def loop(function: _FunctionT) -> _FunctionT:
     """Compile a function that Python calls, and keep its code on the disk; other threads run while it works."""
     # A division by zero gives infinity or NaN, as it does in tensors.
-    options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
     compiled = cast(_FunctionT, numba.njit(cache=True, **options)(function))
     _drop_older(compiled)
     return compiled
@@ -60,5 +60,5 @@ def step(function: _FunctionT) -> _FunctionT:
 
     Wrappers of all steps would take a third of the time of compilation.
     """
-    options = {"nogil": True, "error_model": "numpy", "forceinline": True}
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "forceinline": True}
     return cast(_FunctionT, numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)(function))
