@@ -25,11 +25,13 @@ SOURCES = zlib.crc32(b"".join(path.read_bytes() for path in _FILES))
 """This number changes with the sources of this package."""
 
 
+# A division by zero gives infinity or NaN, as it does in tensors. Nobody calls the functions from C.
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+
+
 def loop(function: _FunctionT) -> _FunctionT:
     """Compile a function that Python calls, and keep its code on the disk; other threads run while it works."""
-    # A division by zero gives infinity or NaN, as it does in tensors.
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-    compiled = cast(_FunctionT, numba.njit(cache=True, **options)(function))
+    compiled = cast(_FunctionT, numba.njit(cache=True, **_OPTIONS)(function))
     _drop_older(compiled)
     return compiled
 
@@ -60,5 +62,5 @@ def step(function: _FunctionT) -> _FunctionT:
 
     Wrappers of all steps would take a third of the time of compilation.
     """
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "forceinline": True}
-    return cast(_FunctionT, numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)(function))
+    options = {**_OPTIONS, "forceinline": True, "no_cpython_wrapper": True}
+    return cast(_FunctionT, numba.njit(**options)(function))
