@@ -27,8 +27,7 @@ from typing import Any
 
 import torch
 
-from benchmark_suites.measures import count_operations
-from benchmark_suites.timing import Row, Spread
+from benchmark_suites.measures import Row, Spread, count_operations
 from benchmark_suites.workloads import load_scenes
 from directshape_torch import Detections, DirectShapeRefiner, FrameBatch
 from directshape_torch.errors import DirectShapeError, InputError

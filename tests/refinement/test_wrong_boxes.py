@@ -8,13 +8,13 @@ import pytest
 
 from directshape_torch import Detections, DirectShapeRefiner, RefinementResult, load_config
 from directshape_torch.geometry.box_formats import poses_to_boxes
-from directshape_torch.laboratory.scenes import load_scene, select_detections
+from directshape_torch.laboratory.scenes import load_scene
 from directshape_torch.status import Status
 
 
 def refined(factor: float, dimensions: float, *settings: str) -> RefinementResult:
     scene = load_scene()
-    first = select_detections(scene.detections, scene.detections.frame_index.new_tensor([0, 1, 3]))
+    first = scene.detections.rows(scene.detections.frame_index.new_tensor([0, 1, 3]))
     T_cam_obj = first.T_cam_obj.clone()
     T_cam_obj[:, :3, 3] *= factor
     moved = replace(first, T_cam_obj=T_cam_obj, dimensions_hwl=first.dimensions_hwl * dimensions)
