@@ -31,7 +31,6 @@ import torch
 from command_line import run_command
 from torch import Tensor
 
-from directshape_torch.cli.options import frame_id_of
 from directshape_torch.evaluation.matching import is_counted, match_to_labels
 from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
@@ -277,7 +276,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--detections", type=Path, metavar="DIR")
     parser.add_argument("--masks", type=Path, metavar="DIR")
     parser.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line")
-    parser.add_argument("--frames", nargs="+", metavar="ID", type=frame_id_of)
+    parser.add_argument("--frames", nargs="+", metavar="ID")
     parser.add_argument("--views", type=int, nargs="+", default=[1, 2, 4, 8], help="frames in a call (default 1 2 4 8)")
     parser.add_argument("--turn-deg", type=float, default=20.0, help="(default 20)")
     parser.add_argument("--interval", type=float, metavar="SECONDS", help="between frames; default: not known")

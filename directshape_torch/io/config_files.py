@@ -43,28 +43,23 @@ def config_from_mapping(cls: type[_GroupT], mapping: Mapping[str, Any], where: s
         >>> config_from_mapping(RefinerConfig, {"silhouette": {"weight": 6}}).silhouette.weight
         6.0
     """
-    return _from_mapping(cls, mapping, where, {f"{where}{path}": path.split(".")[-1] for path in _leaves(cls)})
-
-
-def _from_mapping(cls: type[_GroupT], mapping: Mapping[str, Any], where: str, known: Mapping[str, str]) -> _GroupT:
-    """The group of settings whose keys follow `where`; `known` maps paths of all settings to their names."""
     if not isinstance(mapping, Mapping):
         raise ConfigError(f"{where.rstrip('.') or 'configuration'}: expected keys and values, got {shown(mapping)}")
     hints = cls.types()
     for key in mapping:
         if key not in hints:
-            raise ConfigError(f"unknown key {where}{key!s}; {_other_keys(str(key), where, list(hints), known)}")
-    values = {key: _convert(hints[key], value, f"{where}{key}", known) for key, value in mapping.items()}
+            raise ConfigError(f"unknown key {where}{key!s}; {_other_keys(str(key), where, list(hints))}")
+    values = {key: _convert(hints[key], value, f"{where}{key}") for key, value in mapping.items()}
     try:
         return cls(**values)
     except ConfigError as error:
         raise ConfigError(f"{where}{error}") from error
 
 
-def _other_keys(key: str, where: str, here: Sequence[str], known: Mapping[str, str]) -> str:
+def _other_keys(key: str, where: str, here: Sequence[str]) -> str:
     """Advice that names the key nearest to a misspelt one, or all keys of the group if none is near."""
     # Among equally near keys the first is taken, which belongs to the same group.
-    names = {**{f"{where}{name}": name for name in here}, **known}
+    names = {f"{where}{name}": name for name in here} | {path: path.split(".")[-1] for path in _leaves(RefinerConfig)}
     likeness = {path: difflib.SequenceMatcher(None, name, key).ratio() for path, name in names.items()}
     nearest = max(likeness, key=likeness.__getitem__)
     return f"the nearest known one is {nearest}" if likeness[nearest] > _ALIKE else f"known are {', '.join(here)}"
@@ -81,13 +76,13 @@ def _is_group(hint: Any) -> bool:
     return isinstance(hint, type) and issubclass(hint, Settings)
 
 
-def _convert(hint: Any, value: Any, where: str, known: Mapping[str, str]) -> Any:
+def _convert(hint: Any, value: Any, where: str) -> Any:
     """A value converted to the type of its setting; the group itself checks limits and words."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if _is_group(hint):
-        return _from_mapping(hint, value, f"{where}.", known)
+        return config_from_mapping(hint, value, f"{where}.")
     if origin is tuple:
-        return tuple(_convert(*entry, known) for entry in _entries(arguments, value, where))
+        return tuple(_convert(*entry) for entry in _entries(arguments, value, where))
     if origin is Literal:
         # YAML 1.1 reads the words on and off as truth values.
         word = "on" if value else "off"

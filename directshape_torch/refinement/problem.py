@@ -200,16 +200,13 @@ class CarStage:
         return at._replace(gradient=torch.where(moving, at.gradient, torch.zeros_like(at.gradient)), hessian=hessian)
 
     def free_unknowns(self, state: State) -> Tensor:
-        """Unknowns (B, D) that are free: a bound or the stage may fix others."""
         free = self.unknowns.free(state, self.problem.config.solver.max_code)
         return free & self.unknowns.moving(self.config.unknowns, free.device)
 
     def retract(self, state: AnyState, step: Tensor) -> AnyState:
-        """The state moved by tangent vectors (B, D)."""
         return self.unknowns.retract(state, step, self.problem.config.solver.max_code)
 
     def step_limits(self) -> Tensor:
-        """Largest trusted step of each unknown, (D,) float64; not to be written to."""
         return self.unknowns.largest_steps(self.problem.prior.origin.device)
 
 
@@ -306,7 +303,6 @@ class CarIterations(Table):
         return iterate_natively(problem.prior, terms, self.rest, progress, stage, config, limits, held, record)
 
     def choose(self, accepted: Tensor, new: Evaluation, old: Evaluation) -> Evaluation:
-        """Take the new evaluation of cars whose step was accepted (B,), and the old one of all others."""
         conditions = accepted, accepted[:, None], accepted[:, None, None]
         cost, gradient, hessian = (torch.where(*x) for x in zip(conditions, new[:3], old[:3], strict=True))
 
@@ -318,7 +314,6 @@ class CarIterations(Table):
         return Evaluation(cost, gradient, hessian, tuple(map(chosen, of_blocks, new.anchors, old.anchors)))
 
     def retract(self, state: AnyState, step: Tensor) -> AnyState:
-        """The state moved by tangent vectors (B, D) within the trust region."""
         max_code = self.stage.problem.config.solver.max_code
         return self.stage.unknowns.retract(state, step, max_code, LARGEST_ROTATION_RAD)
 

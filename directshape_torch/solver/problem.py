@@ -163,7 +163,7 @@ class Stage(Protocol[StateT, PreparedT_contra, EvaluationT, FiguresT_co]):
         ...
 
     def step_limits(self) -> Tensor:
-        """Largest trusted step of each unknown, (D,)."""
+        """Largest trusted step of each unknown, (D,); not to be written to."""
         ...
 
 
