@@ -62,37 +62,28 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="the same car in several frames of a sequence gets one shape and a pose in each (docs/tracks.md)",
     )
-    _add_outputs(parser.add_argument_group("output"))
-    _add_settings(parser.add_argument_group("settings"))
-    _add_workers(parser.add_argument_group("workers (docs/run_on_everything.md)"))
-
-
-def _add_outputs(group: argparse._ArgumentGroup) -> None:
-    group.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets data, shapes, summary.json ..")
-    group.add_argument("--overlays", action="store_true", help="write a picture of each frame, before and after")
-    group.add_argument(
+    outputs = parser.add_argument_group("output")
+    outputs.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets data, shapes, summary.json ..")
+    outputs.add_argument("--overlays", action="store_true", help="write a picture of each frame, before and after")
+    outputs.add_argument(
         "--fresh", action="store_true", help="remove the results that runs have left in DIR, start again"
     )
-
-
-def _add_settings(group: argparse._ArgumentGroup) -> None:
-    add_refiner_options(group)
-    add_device_option(group)
-    group.add_argument(
+    settings = parser.add_argument_group("settings")
+    add_refiner_options(settings)
+    add_device_option(settings)
+    settings.add_argument(
         "--batch-frames", type=int, metavar="N", help=f"frames in one call (default: 1, of tracks {_TRACK_FRAMES})"
     )
-
-
-def _add_workers(group: argparse._ArgumentGroup) -> None:
-    group.add_argument("--workers", type=int, metavar="N", help="processes side by side; default: this one alone")
-    group.add_argument(
+    workers = parser.add_argument_group("workers (docs/run_on_everything.md)")
+    workers.add_argument("--workers", type=int, metavar="N", help="processes side by side; default: this one alone")
+    workers.add_argument(
         "--threads",
         type=int,
         default=1,
         metavar="N",
         help="of the CPU, for each worker (default: 1; several stand still where other programs share the cores)",
     )
-    group.add_argument(
+    workers.add_argument(
         "--ray", metavar="HOST:PORT", help="a cluster whose nodes are the workers (docs/many_machines.md)"
     )
 

@@ -171,7 +171,7 @@ def decode_segmentation(path: Path, where: str, segmentation: Any, size_hw: tupl
     """
     if isinstance(segmentation, Mapping) and "counts" in segmentation and "size" in segmentation:
         size = segmentation["size"]
-        if not isinstance(size, (list, tuple)) or len(size) != 2 or not all(map(_is_whole, size)):
+        if not isinstance(size, (list, tuple)) or len(size) != 2 or not all(type(n) is int for n in size):
             raise DataFormatError(path, f"{where}: bad run lengths ('size' is {shown(size)}, expected [height, width])")
         check_size(path, f"{where}: the mask", size, size_hw)
         return _from_runs(path, where, segmentation["counts"], size_hw)
@@ -269,7 +269,3 @@ def _is_polygon(polygon: Any) -> bool:
 
 def _is_number(value: Any) -> bool:
     return type(value) in (int, float)
-
-
-def _is_whole(value: Any) -> bool:
-    return type(value) is int

@@ -41,7 +41,9 @@ def read_poses(path: Path | str) -> NDArray[np.float64]:
     lines = read_lines(path)
     T_world_ref = np.tile(np.eye(4), (len(lines), 1, 1))
     for number, line in enumerate(lines):
-        T_world_ref[number, :3] = _matrix(path, line)
+        T_world_ref[number, :3] = finite_numbers(path, line, 12).reshape(3, 4)
+        if is_no_rotation(torch.from_numpy(T_world_ref[number, None])).any():
+            raise line.error(path, "its first three columns are no rotation")
     return np.linalg.inv(T_world_ref[:1]) @ T_world_ref
 
 
@@ -67,10 +69,3 @@ def _seconds(path: Path | str, line: Line) -> float:
     if not np.isfinite(seconds):
         raise line.error(path, "expected finite seconds")
     return seconds
-
-
-def _matrix(path: Path | str, line: Line) -> NDArray[np.float64]:
-    matrix = finite_numbers(path, line, 12).reshape(3, 4)
-    if is_no_rotation(torch.from_numpy(matrix)[None]).any():
-        raise line.error(path, "its first three columns are no rotation")
-    return matrix

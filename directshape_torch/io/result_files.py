@@ -45,7 +45,8 @@ def result_line(source: KittiObject, refined: RefinedBox) -> str:
     words = source.raw_line.split()
     if not np.isfinite(refined).all():
         raise InputError("refined", "finite numbers", str(refined), "keep the input line of a car that failed")
-    alpha, *box_3d = (_decimal(number) for number in refined)
+    # Four decimals are 0.1 mm. Adding zero turns a negative zero into zero.
+    alpha, *box_3d = (f"{round(float(number), 4) + 0.0:.4f}" for number in refined)
     line = " ".join([*words[:3], alpha, *words[4:8], *box_3d, *words[15:]])
     return line + ("\r" if source.raw_line.endswith("\r") else "")
 
@@ -184,11 +185,6 @@ def _from_text(array: NDArray[Any]) -> Any:
     if array.dtype.kind != "U":
         return array
     return str(array) if array.ndim == 0 else tuple(array.tolist())
-
-
-def _decimal(number: float) -> str:
-    """Four decimals (0.1 mm), without a negative zero."""
-    return f"{round(float(number), 4) + 0.0:.4f}"
 
 
 def track_name(sequence: str, track_id: int) -> str:

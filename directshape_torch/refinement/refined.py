@@ -60,7 +60,10 @@ class Refined(Generic[AnyState]):
             ends: (B,) bool, cars whose states are wanted where their iterations ended, whether they are trusted or not.
                 Default: the cars that were refined.
         """
-        minimum = self.minimum if ends is None else _at_ends(self.minimum, ends)
+        minimum = self.minimum
+        if ends is not None:
+            status = torch.where(ends, Status.converged.code, Status.rejected_worse.code)
+            minimum = replace(minimum, state=where_rows(ends, minimum.end, minimum.state), status=status)
         wanted = is_refined(minimum.status)
         if not torch.is_grad_enabled() or not bool(wanted.any()):
             return minimum.state
@@ -77,8 +80,3 @@ class Refined(Generic[AnyState]):
             exact, limit = backward.mode == "implicit", backward.max_remaining_step
             state = implicit_state(part, minimum, rows, exact=exact, max_remaining_step=limit, names=names[rows])
         return put_rows(minimum.state, rows, state)
-
-
-def _at_ends(minimum: CarMinimum[AnyState], ends: Tensor) -> CarMinimum[AnyState]:
-    status = torch.where(ends, Status.converged.code, Status.rejected_worse.code)
-    return replace(minimum, state=where_rows(ends, minimum.end, minimum.state), status=status)

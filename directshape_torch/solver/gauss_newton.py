@@ -104,12 +104,14 @@ def minimise(
         status = torch.where(ended < 0, Status.max_iterations.code, ended)
         worse = ~(after.cost <= before.cost)
         status = torch.where(worse & ~has_failed(ended), Status.rejected_worse.code, status)
+        columns = [torch.where(running, cost, torch.nan) for running, cost in costs]
+        nothing = torch.empty(num_problems, 0, device=initial[0].device)
         return Minimum(
             state=where_rows(is_refined(status), state, initial),
             end=state,
             status=status,
             iterations=iterations,
-            cost_history=_history(costs, torch.empty(num_problems, 0, device=initial[0].device)),
+            cost_history=torch.stack(columns, dim=1) if columns else nothing,
             stage_starts=tuple(starts),
             stage=stage,
             prepared_end=prepared,
@@ -155,9 +157,3 @@ def _run_stage(
                 trajectory.append(Iteration(number, before, damping, lengths, accepted, improved))
             done += 1
     return progress.best_state, progress.ended, progress.iterations
-
-
-def _history(costs: _Costs, nothing: Tensor) -> Tensor:
-    """The costs in columns (B, iterations), or `nothing` (B, 0), with NaN where a problem took no part."""
-    columns = [torch.where(running, cost, torch.nan) for running, cost in costs]
-    return torch.stack(columns, dim=1) if columns else nothing

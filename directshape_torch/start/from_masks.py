@@ -142,7 +142,9 @@ def _both_senses(frames: FrameBatch, frame_index: Tensor, place: Tensor) -> Tens
     x, z, heading = place[..., :3].unbind(-1)
     normal, offset = (each[frame_index, None] for each in (frames.ground.normal, frames.ground.offset))
     y = -(normal[..., 0] * x + normal[..., 2] * z + offset) / normal[..., 1]
-    away = _facing(x, z, heading)
+    # More cars are seen from behind.
+    faces_camera = torch.cos(heading) * x - torch.sin(heading) * z < 0
+    away = wrap_angle(torch.where(faces_camera, heading + math.pi, heading))
     location = torch.stack([x, y, z], dim=-1)[:, :, None].expand(-1, -1, 2, -1)
     return pose_from_kitti(location, torch.stack([away, wrap_angle(away + math.pi)], dim=-1)).flatten(1, 2)
 
@@ -187,9 +189,3 @@ def _is_one_car(frames: FrameBatch, masks: MaskCrops, frame_index: Tensor, point
     explained = is_beside.sum(dim=1) <= _BESIDE_SHARE * off.isfinite().sum(dim=1)
     beyond = (outline_of(place) - _outline(frames, masks, frame_index)) * place[:, 1:2]
     return explained & (beyond[:, 0] <= _BEYOND_M) & (-beyond[:, 1] <= _BEYOND_M)
-
-
-def _facing(x: Tensor, z: Tensor, heading: Tensor) -> Tensor:
-    """The heading or its opposite, whichever points away from the camera: more cars are seen from behind."""
-    away = torch.cos(heading) * x - torch.sin(heading) * z
-    return wrap_angle(torch.where(away < 0, heading + math.pi, heading))

@@ -53,7 +53,9 @@ def _points(
 ) -> tuple[Tensor, Tensor]:  # (P,), (P, 3)
     """The points at pixels (3, P) that may belong to their car: the numbers of the cars and the positions."""
     object_index, v, u = pixels
-    known = _known(disparity[detections.frame_index[object_index], v, u]).nonzero()[:, 0]
+    measured = disparity[detections.frame_index[object_index], v, u]
+    # Where nothing is measured it is NaN, infinite, zero or negative.
+    known = (measured.isfinite() & (measured > 0)).nonzero()[:, 0]
     object_index, v, u = object_index[known], v[known], u[known]
     frame = detections.frame_index[object_index]
     camera = frames.camera
@@ -96,11 +98,6 @@ def _pixels(frames: FrameBatch, d: Detections) -> Iterator[Tensor]:
             yield torch.cat(part, dim=1)
             part, num_pixels = part[:1], 0
     yield torch.cat(part, dim=1)
-
-
-def _known(disparity: Tensor) -> Tensor:
-    """Mask of the measured disparities; an unmeasured one is NaN, infinite, zero or negative."""
-    return disparity.isfinite() & (disparity > 0)
 
 
 def stands_at(

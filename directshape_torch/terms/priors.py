@@ -14,6 +14,7 @@ from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from directshape_torch.config import PriorConfig
 from directshape_torch.errors import InputError, shown
@@ -125,11 +126,12 @@ class PriorTerm(Term[NoAnchor]):
 
 @dataclass(frozen=True)
 class CarPrior(PriorTerm):
-    """A `CarPrior` is a prior of `prior_terms`, or several of them in one term, whose residuals have `weights`."""
+    """A `CarPrior` is a prior of `prior_terms`, or several of them in one term."""
 
     config: PriorConfig = field(kw_only=True)
     prior: ShapePrior = field(kw_only=True)
-    weights: Mapping[str, float] = field(kw_only=True)  # in the residuals, by the names of the priors
+    # Weights in the residuals, by the names of the priors that one term joins; None for a prior by itself.
+    joined: Mapping[str, float] | None = field(default=None, kw_only=True)
 
     def native_loop(
         self, field: Field, state: State, anchor: NoAnchor, fisher: bool, turn: Turn
@@ -148,9 +150,10 @@ class CarPrior(PriorTerm):
     @cached_property
     def _constants(self) -> PriorArrays:
         cars, prior, like = self.cars, cast(PCAShapePrior, self.prior), self.cars.input_depth
-        pose_sigma = detector_pose_sigma(self.config, cars) if "pose" in self.weights else like.new_empty(len(cars), 4)
+        own = {self.name: 1.0} if self.joined is None else self.joined
+        pose_sigma = detector_pose_sigma(self.config, cars) if "pose" in own else like.new_empty(len(cars), 4)
         no_offset = like.new_empty(len(cars), 0)
-        weights = {f"{name}_weight": float(self.weights.get(name, 0.0)) for name in PRIORS}
+        weights = {f"{name}_weight": float(own.get(name, 0.0)) for name in PRIORS}
         return PriorArrays(
             **weights,
             tilts_by_cosine=self.config.tilt_form == "cosine",
@@ -180,26 +183,8 @@ def prior_terms(config: PriorConfig, prior: ShapePrior, cars: CarBatch) -> list[
         sigma = detector_pose_sigma(config, cars)
         return pose_prior(state.T_obj_cam, cars.detector_T_cam_obj, sigma)
 
-    def term(
-        name: str,
-        weight: float,
-        residual_of: Callable[..., PriorResidual],
-        num_rows: int,
-        sees: str,
-        is_prior: bool = True,
-    ) -> CarPrior:
-        return CarPrior(
-            name,
-            weight,
-            cars,
-            residual_of,
-            num_rows,
-            (sees,),
-            is_prior,
-            config=config,
-            prior=prior,
-            weights={name: 1.0},
-        )
+    def term(name: str, weight: float, residual_of: Callable[..., PriorResidual], num_rows: int, sees: str) -> CarPrior:
+        return CarPrior(name, weight, cars, residual_of, num_rows, (sees,), config=config, prior=prior)
 
     tilt, num_tilts = (tilt_prior_normal, 2) if config.tilt_form == "normal" else (tilt_prior_cosine, 1)
     all_terms = [
@@ -212,7 +197,7 @@ def prior_terms(config: PriorConfig, prior: ShapePrior, cars: CarBatch) -> list[
         all_terms.append(term("pose", config.pose_weight, of_pose, 4, POSE))
     if cars.num_offsets:
         # This prior belongs to the measurements, because it limits how well the images measure a car.
-        all_terms.append(term("rig", RIG_WEIGHT, rig_prior, 1, OFFSET, is_prior=False))
+        all_terms.append(replace(term("rig", RIG_WEIGHT, rig_prior, 1, OFFSET), is_prior=False))
     return [term for term in all_terms if term.weight > 0]
 
 
@@ -233,10 +218,9 @@ def _joined(terms: Sequence[CarPrior]) -> CarPrior:
         scale = constant_like(scales, residual)
         return PriorResidual(residual * scale, torch.cat(placed, dim=1) * scale[:, None])
 
-    weights = {term.name: term.weight for term in terms}
-    sees = POSE, CODE
+    joined, sees = {term.name: term.weight for term in terms}, (POSE, CODE)
     return replace(
-        terms[0], name="priors", weight=1.0, residual_of=residual_of, num_rows=len(scales), sees=sees, weights=weights
+        terms[0], name="priors", weight=1.0, residual_of=residual_of, num_rows=len(scales), sees=sees, joined=joined
     )
 
 
@@ -272,7 +256,7 @@ def height_prior(cars: CarBatch, state: State) -> PriorResidual:
     n_obj, n_y = _ground_normal_obj(cars, state), cars.ground_normal_cam[:, 1]
     residual = (cars.ground_offset - (n_obj * state.T_obj_cam[:, :3, 3]).sum(-1)) / n_y
     J_v = -n_obj / n_y[:, None]
-    return PriorResidual(residual[:, None], torch.nn.functional.pad(J_v, (0, 3))[:, None])
+    return PriorResidual(residual[:, None], pad(J_v, (0, 3))[:, None])
 
 
 def tilt_prior_normal(cars: CarBatch, state: State) -> PriorResidual:
@@ -283,23 +267,18 @@ def tilt_prior_normal(cars: CarBatch, state: State) -> PriorResidual:
     x, y, z = _ground_normal_obj(cars, state).unbind(-1)
     zero = torch.zeros_like(x)
     J_x, J_z = torch.stack([zero, z, -y], dim=-1), torch.stack([y, -x, zero], dim=-1)
-    return PriorResidual(torch.stack([x, z], dim=-1), _by_rotation(torch.stack([J_x, J_z], dim=1)))
+    return PriorResidual(torch.stack([x, z], dim=-1), pad(torch.stack([J_x, J_z], dim=1), (3, 0)))
 
 
 def tilt_prior_cosine(cars: CarBatch, state: State) -> PriorResidual:
     """The paper's `r_rot = 1 - (R_cam_obj [0, -1, 0]) . n = 1 + n_obj.y`; its Jacobian is zero where r is zero."""
     x, y, z = _ground_normal_obj(cars, state).unbind(-1)
     J_omega = torch.stack([-z, torch.zeros_like(x), x], dim=-1)[:, None]
-    return PriorResidual((1 + y)[:, None], _by_rotation(J_omega))
+    return PriorResidual((1 + y)[:, None], pad(J_omega, (3, 0)))
 
 
 def _ground_normal_obj(cars: CarBatch, state: State) -> Tensor:
     return (state.T_obj_cam[:, :3, :3] * cars.ground_normal_cam[:, None]).sum(-1)
-
-
-def _by_rotation(J_omega: Tensor) -> Tensor:
-    """Jacobian by the pose of a residual that only rotation changes, from its Jacobian (B, R, 3) by omega."""
-    return torch.nn.functional.pad(J_omega, (3, 0))
 
 
 def dimensions_prior(

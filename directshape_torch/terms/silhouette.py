@@ -197,7 +197,7 @@ class Silhouettes(OfMasks[Closest]):
 
     def changing_rows(self, prepared: Prepared, after_wider: bool) -> tuple[Self, Closest, Tensor]:
         """Keep the rays that are or may come near the contour; the other rays stay certain during the next steps."""
-        distance = self._least_distance(prepared)
+        distance = prepared.field.sdf(prepared.closest.points_obj, self.rows.rays.owner)
         margin = _IN_PLAY_MARGIN_M * self.zeta
         if after_wider:
             margin = margin.clamp_max(_MARGIN_EXPONENT_AFTER_WIDER)
@@ -250,9 +250,6 @@ class Silhouettes(OfMasks[Closest]):
         depth = anchor.depth - torch.where(is_kink, off_face / torch.where(is_kink, across, 1.0), 0.0)
         sdf = field.sdf(rays.at(depth), self.rows.rays.owner)
         return self._of_distance(sdf, anchor.crosses)[0][..., None]
-
-    def _least_distance(self, prepared: Prepared) -> Tensor:
-        return prepared.field.sdf(prepared.closest.points_obj, self.rows.rays.owner)
 
     def _of_distance(self, sdf: Tensor, crosses: Tensor) -> tuple[Tensor, Tensor]:
         """Residual (M, R) of least distances, and its derivative; rays outside the bounds have a constant residual."""
