@@ -142,6 +142,8 @@ class Detections(TensorRecord):
         *,
         mask_left: Masks | None = None,
         mask_right: Masks | None = None,
+        has_mask_left: Given | None = None,
+        has_mask_right: Given | None = None,
         frame_index: Given | None = None,
         score: Given | None = None,
         box_2d: Given | None = None,
@@ -162,6 +164,8 @@ class Detections(TensorRecord):
             mask_left, mask_right: (B, H, W) bool, uint8 (0 and 1, or 0..255) or foreground probability; or B entries
                 that are (H, W) or None; tensors or numpy arrays. Right masks may be left out, left ones not: a car
                 without a left mask is not refined.
+            has_mask_left, has_mask_right: (B,) bool, which masks are there; other masks are not read. By default all
+                are there.
             frame_index: (B,) default all 0.
             score: (B,) default all 1.
             box_2d: (B, 4) u_min, v_min, u_max, v_max of the left image; default: the box around the left mask.
@@ -190,11 +194,11 @@ class Detections(TensorRecord):
         if mask_left is None:
             cure = "give mask_left; a car without a left mask is not refined"
             raise InputError("mask_left", f"masks of {count} cars in the left image", "None", cure)
-        left = MaskCrops.of(mask_left, "mask_left")
+        left = MaskCrops.of(mask_left, has_mask_left, "mask_left")
         right = (
             MaskCrops.none(count, left.size_hw, left.values)
             if mask_right is None
-            else MaskCrops.of(mask_right, "mask_right")
+            else MaskCrops.of(mask_right, has_mask_right, "mask_right")
         )
         _check_mask_numbers(left, right, count)
         return cls(

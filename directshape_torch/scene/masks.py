@@ -62,23 +62,27 @@ class MaskCrops(TensorRecord):
             raise InputError("boxes", expected, str(self._boxes), "make crops with MaskCrops.of")
 
     @classmethod
-    def of(cls, masks: Masks, name: str = "masks") -> Self:
+    def of(cls, masks: Masks, present: Given | None = None, name: str = "masks") -> Self:
         """Crops of masks in any form that users have.
 
         Args:
             masks: (B, H, W) or B entries that are (H, W) or None, tensors or numpy arrays, or crops: bool, uint8 (0 and
                 1 where nothing in the array is larger, else 0..255), or foreground probability. Masks that require
                 gradients are kept whole, because zeros have gradients, too.
+            present: (B,) bool, which masks are there; other masks are not read. None means that all are there.
             name: name of the argument, for errors.
 
         Raises:
             InputError: no masks of one size, another dtype, or values above 1.5.
         """
         if isinstance(masks, cls):
-            return masks
+            return masks if present is None else masks.where(_flags(name, present, len(masks)))
         masks = masks if isinstance(masks, (list, tuple)) else as_tensor(masks)
         entries = _entries(name, masks)
         first = next(mask for mask in (*entries, masks) if isinstance(mask, Tensor))
+        if present is not None:
+            here = _flags(name, present, len(entries)).tolist()
+            entries = [mask if flag else None for mask, flag in zip(entries, here, strict=True)]
         used = _foreground([mask for mask in entries if mask is not None], together=isinstance(masks, Tensor))
         supports = _supports(used)
         known = iter(supports)
@@ -183,6 +187,13 @@ class MaskCrops(TensorRecord):
         values = torch.cat(parts) if parts else self.values[:0]
         return type(self)(values, self.boxes.index_select(0, index.to(self.boxes.device)), self.size_hw)
 
+    def where(self, present: Tensor) -> Self:
+        """The masks where `present` (B,) holds; other instances have no mask."""
+        check_shape("present", present, (len(self),), kind="flags")
+        parts = [self.crop(row).view(-1) for row, here in enumerate(present.tolist()) if here]
+        values = torch.cat(parts) if parts else self.values[:0]
+        return type(self)(values, self.boxes * present[:, None].to(self.boxes), self.size_hw)
+
     def above(self, end: Tensor) -> Self:
         """The masks without what lies in row `end` (B,) of the image or below it."""
         boxes = self.boxes.clone()
@@ -274,6 +285,15 @@ def _first_and_end(
     first = none.scatter_reduce(0, owner, torch.where(every, position, beyond), "amin")
     end = torch.zeros_like(start).scatter_reduce(0, owner, torch.where(every, position + 1, 0), "amax")
     return torch.where(first == beyond, 0, first), end
+
+
+def _flags(name: str, present: Given, count: int) -> Tensor:
+    """Flags (B,) that say which masks are there."""
+    flags = as_tensor(present)
+    # An empty list has no dtype of its own.
+    flags = flags.bool() if isinstance(flags, Tensor) and flags.shape == (0,) else flags
+    check_shape(f"has_{name}", flags, (count,), kind="flags")
+    return flags
 
 
 def _entries(name: str, masks: Tensor | Sequence[Tensor | NDArray[Any] | None]) -> list[Tensor | None]:

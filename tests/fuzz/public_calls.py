@@ -288,7 +288,7 @@ def _boxes(detections: Detections) -> dict[str, Any]:
     """Every argument of `Detections.from_boxes`."""
     zeros = torch.zeros(2).double()
     boxes = torch.stack([zeros, zeros + 1, zeros + 20, zeros + 1.5, zeros + 1.6, zeros + 4, zeros + 0.3], dim=1)
-    names = ("frame_index", "score", "box_2d", "pose_sigma")
+    names = ("has_mask_left", "has_mask_right", "frame_index", "score", "box_2d", "pose_sigma")
     given = {name: getattr(detections, name) for name in names}
     given |= {name: getattr(detections, name).dense() for name in ("mask_left", "mask_right")}
     return {"boxes": boxes, "convention": "kitti", "track_id": torch.tensor([-1, 3]), **given}

@@ -17,7 +17,6 @@ from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.geometry.stereo_depth import disparity_of_depth
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
-from directshape_torch.scene.masks import MaskCrops
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 CAMERA_HEIGHT_M = 1.65
@@ -140,19 +139,13 @@ def disturbed(detections: Detections, metres: float = 0.15, radians: float = 0.0
     return replace(detections, T_cam_obj=detections.T_cam_obj @ se3.exp(noise))
 
 
-def some_masks(masks: MaskCrops, present: Tensor) -> MaskCrops:
-    """The masks where a condition (B,) is true; other instances have no mask."""
-    parts = [masks.crop(row).view(-1) for row, here in enumerate(present.tolist()) if here]
-    return replace(masks, values=torch.cat([masks.values[:0], *parts]), boxes=masks.boxes * present[:, None])
-
-
 def masked(detections: Detections, left: Tensor | None = None, right: Tensor | None = None) -> Detections:
     """The detections with masks only where a condition (B,) is true."""
     masks_left, masks_right = detections.mask_left, detections.mask_right
     return replace(
         detections,
-        mask_left=masks_left if left is None else some_masks(masks_left, left),
-        mask_right=masks_right if right is None else some_masks(masks_right, right),
+        mask_left=masks_left if left is None else masks_left.where(left),
+        mask_right=masks_right if right is None else masks_right.where(right),
     )
 
 

@@ -47,7 +47,8 @@ def test_the_bundled_frame_ends_where_tensor_operations_take_it(changes: list[st
 
 def test_a_frame_without_right_masks_ends_where_tensor_operations_take_it() -> None:
     frames, detections = collate(demo_scene().frames)
-    masks = MaskCrops.of(torch.zeros(len(detections), *frames.images_left.shape[2:], dtype=torch.bool))
+    nowhere = torch.zeros(len(detections), dtype=torch.bool)
+    masks = MaskCrops.of(torch.zeros(len(detections), *frames.images_left.shape[2:], dtype=torch.bool), nowhere)
     detections, refiner = replace(detections, mask_right=masks), DirectShapeRefiner()
     native = refiner(frames, detections)
     with without_kernels():

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.synthetic_scene import some_masks
 from reference.occlusion import hidden_pixels as one_by_one
 from torch import Tensor
 
@@ -91,7 +90,7 @@ def test_equals_other_frames_and_absent_masks_hide_nothing() -> None:
     assert not instances_in_front(scene([10.0, 10.0], [1.0, 2.0]), "left").any()
     assert not instances_in_front(scene([10.0, 20.0], [2.0, 1.0], frame=[0, 1]), "left").any()
     both = scene([10.0, 20.0], [2.0, 1.0], squares((0, 0, 4, 4), (0, 0, 4, 4)))
-    blind = replace(both, mask_left=some_masks(both.mask_left, torch.tensor([False, True])))
+    blind = replace(both, mask_left=both.mask_left.where(torch.tensor([False, True])))
     index, uv = all_pixels(2)
     assert hidden_pixels(both, "left", index, uv).any()
     assert not hidden_pixels(blind, "left", index, uv).any()

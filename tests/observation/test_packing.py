@@ -19,7 +19,7 @@ from directshape_torch.observation.packing import Observation, car_regions, pack
 from directshape_torch.scene.detections import Detections, Occluders
 from directshape_torch.scene.frames import FrameBatch, Side
 from directshape_torch.scene.masks import MaskCrops
-from tests.helpers.synthetic_scene import some_masks, stereo_camera
+from tests.helpers.synthetic_scene import stereo_camera
 
 PADDING = 0.77  # grey that must not matter
 
@@ -85,8 +85,8 @@ def random_scene(seed: int, count: int, num_frames: int = 3, others: int = 4) ->
         dimensions_hwl=torch.ones(count, 3),
         box_2d=torch.cat([low, low + torch.rand(count, 2, generator=generator) * 60], dim=1),
         score=torch.ones(count),
-        mask_left=some_masks(MaskCrops.of(random_masks(generator, frame_index, sizes, shape)), present[0]),
-        mask_right=some_masks(MaskCrops.of(random_masks(generator, frame_index, sizes, shape)), present[1]),
+        mask_left=MaskCrops.of(random_masks(generator, frame_index, sizes, shape), present[0]),
+        mask_right=MaskCrops.of(random_masks(generator, frame_index, sizes, shape), present[1]),
         occluders=occluders if others else None,
     )
     return frames, detections

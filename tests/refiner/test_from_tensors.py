@@ -96,6 +96,7 @@ GIVEN = {
     "box_2d": torch.tensor([[10.0, 20.0, 30.0, 40.0], [20.0, 20.0, 50.0, 60.0]]),
     "pose_sigma": torch.full((2, 4), 0.5),
     "track_id": torch.tensor([3, -1]),
+    "has_mask_left": torch.tensor([True, False]),
     "T_cam_boxes": MOTION,
 }
 

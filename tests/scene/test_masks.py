@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.synthetic_scene import some_masks
 from torch import Tensor
 
 from directshape_torch.errors import InputError
@@ -110,19 +109,33 @@ def test_rows_count_from_the_end_too() -> None:
         assert crops.crop(row).equal(masks[row, 1:3, row % 3 : row % 3 + 3])
     with pytest.raises(IndexError):
         crops[3]
+    with pytest.raises(InputError, match=r"present: expected shape \(3,\), got \(1,\)"):
+        crops.where(torch.tensor([True]))
 
 
-def test_each_mask_of_a_list_says_whether_its_bytes_are_shades_of_grey() -> None:
+def test_whether_bytes_are_shades_of_grey_the_masks_that_are_there_say() -> None:
     masks = torch.tensor([[[1, 0], [1, 1]], [[200, 0], [0, 0]]], dtype=torch.uint8)
+    assert MaskCrops.of(masks, [True, False]).areas.tolist() == [3, 0]
     assert MaskCrops.of(masks).areas.tolist() == [0, 1]
     assert MaskCrops.of(list(masks)).areas.tolist() == [3, 1]
+    assert MaskCrops.of(masks, [False, False]).values.dtype == torch.bool
 
 
-def test_rows_joined_padded_and_moved() -> None:
+def test_absent_masks_are_never_read() -> None:
+    masks = torch.full((2, 4, 6), torch.nan)
+    masks[0] = 0.0
+    crops = MaskCrops.of(masks, torch.tensor([True, False]))
+    assert crops.areas.tolist() == [0, 0]
+    assert not len(crops.values)
+
+
+def test_rows_where_joined_padded_and_moved() -> None:
     masks = random_masks(5, torch.Generator().manual_seed(9)).nan_to_num(0.7)
     crops = MaskCrops.of(masks)
     index = torch.tensor([3, 0, 3])
     assert crops.rows(index).dense().equal(masks[index])
+    present = torch.tensor([True, False, True, False, True])
+    assert crops.where(present).dense().equal(masks * present[:, None, None])
     assert (
         MaskCrops.joined([crops, crops.rows(index[:0]), crops.rows(index)])
         .dense()
@@ -133,6 +146,7 @@ def test_rows_joined_padded_and_moved() -> None:
     assert crops.to(torch.float64).values.dtype == torch.float64
     assert MaskCrops.of(masks > 0.5).to(torch.float64).values.dtype == torch.bool
     assert MaskCrops.of(crops) is crops
+    assert MaskCrops.of(crops, present).dense().equal(masks * present[:, None, None])
     assert MaskCrops.none(3, (4, 6), masks).dense().equal(torch.zeros(3, 4, 6))
     with pytest.raises(InputError, match=r"records: expected masks of images of one size, .*; pad them"):
         MaskCrops.joined([crops, padded])
@@ -157,9 +171,7 @@ def test_gradients_do_not_depend_on_who_looked_at_the_masks_first(
     with look():
         crops.rows((crops.areas > 0).nonzero()[:, 0])
     some = crops.rows(torch.tensor([2, 0]))
-    (
-        some.values.sum() + some_masks(crops, torch.tensor([True, False, False])).dense().sum() + crops[1].sum()
-    ).backward()
+    (some.values.sum() + crops.where(torch.tensor([True, False, False])).dense().sum() + crops[1].sum()).backward()
     assert masks.grad is not None
     assert masks.grad.unique(dim=0).tolist() == [[[1.0] * 31] * 23, [[2.0] * 31] * 23]
     leaf = replace(crops, values=crops.values.detach().requires_grad_())
@@ -174,6 +186,7 @@ def test_more_than_a_probability_is_named(value: float) -> None:
     got = f"got a value of {value:g} in mask 1; apply a sigmoid to logits, or divide by 255"
     with pytest.raises(InputError, match=rf"^right: expected foreground probabilities in \[0, 1\], {got}"):
         MaskCrops.of(masks, name="right")
+    assert MaskCrops.of(masks, torch.tensor([True, False, True])).areas.tolist() == [0, 0, 1]
 
 
 def test_masks_may_overshoot_by_resampling() -> None:
@@ -242,6 +255,17 @@ def test_what_is_no_mask_of_its_box_is_named(box: Any, pixels: Any, like: Tensor
     good = ((0, 0, 3, 2), INSIDE)
     with pytest.raises(InputError, match=text):
         MaskCrops.of_boxes([good, (box, pixels)], (4, 6), like)
+
+
+@pytest.mark.parametrize("form", [lambda masks: masks, MaskCrops.of])
+def test_flags_are_the_same_for_every_form_of_masks(form: Callable[[Tensor], Any]) -> None:
+    masks = form(random_masks(3, torch.Generator().manual_seed(5)))
+    assert MaskCrops.of(masks, np.array([True, False, True])).areas.tolist()[1] == 0
+    with pytest.raises(InputError, match=r"has_right: expected shape \(3,\), got \(1,\)"):
+        MaskCrops.of(masks, [True], "right")
+    with pytest.raises(InputError, match=r"has_right: expected bool, got torch.int64"):
+        MaskCrops.of(masks, [1, 0, 1], "right")
+    assert len(MaskCrops.of(form(torch.zeros(0, 4, 6)), [])) == 0
 
 
 def test_boxes_must_hold_the_values() -> None:

@@ -10,7 +10,7 @@ import torch
 import trimesh
 from helpers.bundled_frame import BOXES, DEMO, MASKS
 from helpers.ellipsoids import ellipsoid_prior
-from helpers.synthetic_scene import cached_street, disturbed, joined_frames, masked
+from helpers.synthetic_scene import cached_street, disturbed, joined_frames
 
 from directshape_torch import (
     Detections,
@@ -98,7 +98,8 @@ def call_of_two_frames() -> tuple[FrameBatch, Detections, RefinementResult]:
     prior, street = cached_street()
     d = disturbed(street.detections)
     seen = torch.tensor([False, True])
-    detections = replace(masked(d, seen, seen), frame_index=torch.tensor([0, 1]))
+    masks = {"mask_left": d.mask_left.where(seen), "mask_right": d.mask_right.where(seen)}
+    detections = replace(d, frame_index=torch.tensor([0, 1]), **masks)
     frames = joined_frames([street.frames, street.frames])
     result = DirectShapeRefiner(prior, load_config("fast"))(frames, detections)
     # Grey images would hide grey lines.
