@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path, PurePath
 
@@ -16,7 +16,7 @@ from directshape_torch.io.image_files import IMAGE_ENDINGS
 def chosen_frames(layout: FrameLayout, split: Path | str | None, frames: Iterable[str | int] | None) -> tuple[str, ...]:
     """The frames of a layout that a file and a list choose; raises `InputError` if none is left."""
     known = layout.frame_ids()
-    known = known if split is None else frames_of_split(split, known, partial(_has_image, layout))
+    known = known if split is None else frames_of_split(split, known, partial(_has_image, layout), layout.sequence)
     folder = layout.detections_dir
     where = f"{folder or 'the left images'}" if split is None else f"{split}"
     if not known:
@@ -64,16 +64,19 @@ def frames_among(known: Sequence[str], wanted: Iterable[str | int], expected: st
 
 
 def frames_of_split(
-    path: Path | str, known: Sequence[str], exists: Callable[[str], bool] = lambda _: False
+    path: Path | str, known: Sequence[str], exists: Callable[[str], bool] = lambda _: False, sequence: str = ""
 ) -> list[str]:
     """The frames that the lines of a file name, each once.
 
-    A line is an id, a number with or without leading zeros, or a path that ends in an id (`image_2/000107.png`).
+    A line is an id, a number with or without leading zeros, a path that ends in an id (`image_2/000107.png`), or folder
+    and number of a drive as in lists for KITTI's raw data (`2011_09_26/2011_09_26_drive_0005_sync 0000000005 l`).
 
     Args:
         path: the file of the split.
         known: frames with detections.
         exists: whether a frame with a name exists; a frame without detections is reported when it is loaded.
+        sequence: name of the sequence of the frames, which must be the first word of a line with two words; "" if it is
+            not known.
 
     Raises:
         DataFormatError: a line names no frame.
@@ -81,7 +84,10 @@ def frames_of_split(
     found = _by_name(known)
     chosen = []
     for line in read_lines(path):
-        names = [name for word in (line.text, PurePath(line.text).name) for name in (word, _without_ending(word))]
+        folder, *others = (PurePath(word).name for word in line.text.split())
+        other = next(iter(others), "")
+        words = [line.text, f"{folder}_{other}", _frame_word(folder, other, sequence, found)]
+        names = [name for word in words for name in (word, _without_ending(word))]
         keys = [key for name in names for key in (name, _key(name)) if key in found]
         unknown = [name for name in names if is_frame_id(name) and exists(name)] if not keys else []
         if not keys and not unknown:
@@ -89,6 +95,16 @@ def frames_of_split(
             raise line.error(path, "names no frame of the data", f"write one id a line{example}")
         chosen.append(found[keys[0]] if keys else unknown[0])
     return list(dict.fromkeys(chosen))
+
+
+def _frame_word(folder: str, other: str, sequence: str | None, found: Mapping[str, str]) -> str:
+    """The first or second word of a line, if it names a frame of the sequence, or "" for another sequence."""
+    is_frame, other_is_frame = (
+        bool({_key(word), _key(_without_ending(word))} & found.keys()) for word in (folder, other)
+    )
+    if not other_is_frame or (is_frame and not sequence):
+        return folder
+    return other if sequence in ("", folder) else ""
 
 
 def _by_name(known: Sequence[str]) -> dict[str, str]:

@@ -102,6 +102,7 @@ class FrameLayout(Protocol):
 
     detections_dir: Path | None  # folder of the detections; None where boxes are made of masks
     detection_file_name: str  # for messages, such as "NNNNNN.txt"
+    sequence: str  # name of the only sequence; "" for several sequences or sequences without names
 
     def frame_ids(self) -> list[str]:
         """All frames that have detections, or without a folder of these all frames that have an image, sorted."""

@@ -111,6 +111,7 @@ class Layout:
         self._sequences, self._single = sequences, single
         patterns = next(iter(sequences.values()))[1]
         self._ending = Path(patterns.detections).suffix
+        self.sequence = next(iter(sequences)) if single else ""
         self.detection_file_name = patterns.detections + ("" if "" in sequences else " or SEQUENCE.txt")
 
     def frame_ids(self) -> list[str]:

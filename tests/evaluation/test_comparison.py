@@ -12,7 +12,7 @@ from helpers.shape_arrays import shape_arrays
 from directshape_torch.cli.main import main
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.comparison import compare_results
-from directshape_torch.evaluation.matching import objects_of_frame
+from directshape_torch.evaluation.matching import chosen_frames, objects_of_frame
 from directshape_torch.evaluation.reports import format_comparison
 from directshape_torch.io.result_files import ShapeArrays, write_shapes
 
@@ -209,6 +209,12 @@ def test_a_file_in_the_folder_of_its_sequence_is_one_of_a_frame(tmp_path: Path, 
     # A file of the tracking benchmark may be called as a frame of another sequence.
     (tmp_path / "000008.txt").write_text("7 1 " + _line("near", 0, 8, score="0.5") + "\n")
     assert len(objects_of_frame(tmp_path / "000008.txt", "0005_000007")) == 1
+
+
+def test_a_split_of_drives_serves_the_evaluation(tmp_path: Path) -> None:
+    """Which drive its files are of, nobody says there."""
+    (tmp_path / "split.txt").write_text("2011_09_26/2011_09_26_drive_0005_sync 0000000007 l\n")
+    assert chosen_frames(["0000000005", "0000000007"], None, tmp_path / "split.txt", "frames") == ["0000000007"]
 
 
 def test_command_prints_and_writes(

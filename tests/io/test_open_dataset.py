@@ -179,11 +179,31 @@ def test_a_line_of_a_split_names_a_frame_in_many_ways(kitti: Path, tmp_path: Pat
     assert dataset.frame_ids == ("000001",)
 
 
-@pytest.mark.parametrize("text", ["000777", "frame 1 was bad", "0001 000000", "1 0"])
-def test_lines_of_a_split_that_name_nothing(kitti: Path, tmp_path: Path, text: str) -> None:
-    write(tmp_path / "split.txt", f"000001\n{text}\n")
-    with pytest.raises(DataFormatError, match=r"split.txt, line 2: names no frame of the data: .* such as 00000"):
-        open_dataset("kitti", kitti, kitti / "detections", kitti / "masks", split=tmp_path / "split.txt")
+def test_a_split_of_raw_drives_and_lines_that_name_nothing(kitti: Path, tmp_path: Path) -> None:
+    drive = write_raw(kitti, tmp_path, FRAMES)
+    shutil.copytree(drive, drive.parent / "2011_09_26_drive_0009_sync")
+    detections, masks = renamed(kitti, tmp_path, (f"{DRIVE}/data/0000000000", f"{DRIVE}/data/0000000001"))
+    split = tmp_path / "split.txt"
+    write(split, f"{DAY}/{DRIVE} 0000000001 l\n{DAY}/2011_09_26_drive_0009_sync 0000000000 r\n")
+    dataset = open_dataset("raw", tmp_path / DAY, detections, masks, split=split)
+    # The second has no detections, which is said when its turn comes.
+    assert dataset.frame_ids == (f"{DRIVE}_0000000001", "2011_09_26_drive_0009_sync_0000000000")
+    write(split, f"{DAY}/{DRIVE} 0000000001 l\n{DAY}/{DRIVE} 0000000777 l\n")
+    with pytest.raises(DataFormatError, match=rf"split.txt, line 2: names no frame of the data: .* such as {DRIVE}"):
+        open_dataset("raw", tmp_path / DAY, detections, masks, split=split)
+
+
+def test_a_split_of_drives_where_one_is_open(kitti: Path, tmp_path: Path) -> None:
+    """Frames of other drives have the same numbers, and words are no drive."""
+    drive = write_raw(kitti, tmp_path, FRAMES)
+    detections, masks = renamed(kitti, tmp_path, ("data/0000000000", "data/0000000001"))
+    split = tmp_path / "split.txt"
+    write(split, f"{DAY}/{DRIVE} 0000000001 l\n")
+    assert open_dataset("raw", drive, detections, masks, split=split).frame_ids == ("0000000001",)
+    for line in (f"{DAY}/2011_09_26_drive_0009_sync 0000000001 l", "frame 1 was bad", "0001 000000", "1 0"):
+        write(split, f"0000000000\n{line}\n")
+        with pytest.raises(DataFormatError, match=r"split.txt, line 2: names no frame of the data"):
+            open_dataset("raw", drive, detections, masks, split=split)
 
 
 @pytest.mark.parametrize("name", ["0005.txt", "instances.txt"])
