@@ -59,7 +59,7 @@ class ShapeFit:
 @full_precision()
 def fit_shape(
     points: Given,  # (P, 3) metres
-    boxes: Given,  # (N, 7)
+    boxes: Given,  # (N, 7) or (N, 8, 3)
     convention: BoxFormat = "mmdet3d_lidar",
     prior: ShapePrior | None = None,
 ) -> ShapeFit:

@@ -260,7 +260,7 @@ class RefinementResult(CarRecord):
         return poses_to_boxes(T_frame_box, dimensions, convention, T_cam_boxes)
 
     def corners(self, frame: Frame = "cam") -> Tensor:
-        """Corners (B, 8, 3) of the boxes in the order of KITTI's devkit.
+        """Corners (B, 8, 3) of the boxes in the order of KITTI's devkit, which `Detections.from_boxes` reads.
 
         The four corners on the ground come first, from front left to front right and round the box, then the four
         corners above them.

@@ -137,7 +137,7 @@ class Detections(TensorRecord):
     @classmethod
     def from_boxes(
         cls,
-        boxes: Given,  # (B, 7)
+        boxes: Given,  # (B, 7) or (B, 8, 3)
         convention: BoxFormat = "kitti",
         *,
         mask_left: Masks | None = None,
@@ -158,8 +158,8 @@ class Detections(TensorRecord):
         refiner then converts them to the dtype of the frames. Arrays and lists may take the place of tensors.
 
         Args:
-            boxes: x, y, z, three sizes and heading, in metres and radians; the convention says what they mean and
-                in which order they are (`directshape_torch.geometry.box_formats`).
+            boxes: x, y, z, three sizes and heading, or corners, in metres and radians; the convention says what they
+                mean and in which order they are (`directshape_torch.geometry.box_formats`).
             convention: "kitti", "mmdet3d_camera", "mmdet3d_lidar", "openpcdet", "nuscenes" or "opencv".
             mask_left, mask_right: (B, H, W) bool, uint8 (0 and 1, or 0..255) or foreground probability; or B entries
                 that are (H, W) or None; tensors or numpy arrays. Right masks may be left out, left ones not: a car
@@ -176,7 +176,7 @@ class Detections(TensorRecord):
 
         Raises:
             InputError: no masks at all, LiDAR boxes without `T_cam_boxes`, a motion that tilts boxes over (as its
-                inverse may), and what the class raises.
+                inverse may), corners that make no box, and what the class raises.
 
         Examples:
             >>> boxes = torch.tensor([[1.0, 0.85, 20.0, 4.0, 1.6, 1.5, 0.3]])

@@ -46,6 +46,66 @@ def test_every_convention_says_the_same_car(convention: BoxFormat) -> None:
     torch.testing.assert_close(again, boxes, atol=1e-9, rtol=0)
 
 
+def tools_corners(convention: BoxFormat) -> torch.Tensor:
+    """Corners by each tool's own formula, from its own numbers."""
+    x, y, z, *sizes, yaw = WRITTEN[convention]
+    c, s = math.cos(yaw), math.sin(yaw)
+    unravelled = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)])[[0, 1, 3, 2, 4, 5, 7, 6]].double()
+    about_y = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=torch.float64)
+    about_z = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
+    at = torch.tensor([x, y, z], dtype=torch.float64)
+    if convention == "mmdet3d_camera":
+        local = (unravelled - torch.tensor([0.5, 1.0, 0.5])) * torch.tensor(sizes)
+        return local.double() @ about_y.T + at
+    if convention == "mmdet3d_lidar":
+        local = (unravelled - torch.tensor([0.5, 0.5, 0.0])) * torch.tensor(sizes)
+        return local.double() @ about_z.T + at
+    if convention == "openpcdet":  # boxes_to_corners_3d of pcdet/utils/box_utils.py
+        template = torch.tensor(
+            [[1, 1, -1], [1, -1, -1], [-1, -1, -1], [-1, 1, -1], [1, 1, 1], [1, -1, 1], [-1, -1, 1], [-1, 1, 1]]
+        )
+        local = template / 2 * torch.tensor(sizes)
+        return local.double() @ about_z.T + at
+    if convention == "nuscenes":
+        w, length, h = sizes
+        xs = length / 2 * torch.tensor([1.0, 1, 1, 1, -1, -1, -1, -1])
+        ys = w / 2 * torch.tensor([1.0, -1, -1, 1, 1, -1, -1, 1])
+        zs = h / 2 * torch.tensor([1.0, 1, -1, -1, 1, 1, -1, -1])
+        return torch.stack([xs, ys, zs], 1).double() @ about_z.T + at
+    h, w, length = HWL
+    xs = length / 2 * torch.tensor([1.0, 1, -1, -1, 1, 1, -1, -1])
+    ys = -h * torch.tensor([0.0, 0, 0, 0, 1, 1, 1, 1]) + (h / 2 if convention == "opencv" else 0.0)
+    zs = w / 2 * torch.tensor([1.0, -1, -1, 1, 1, -1, -1, 1])
+    return torch.stack([xs, ys, zs], 1).double() @ about_y.T + at
+
+
+@pytest.mark.parametrize("convention", WRITTEN)
+def test_corners_are_read_in_each_tools_own_order(convention: BoxFormat) -> None:
+    corners = tools_corners(convention)[None]
+    T_cam_obj, hwl = boxes_to_poses(corners, convention, MOTION.get(convention))
+    torch.testing.assert_close(T_cam_obj, expected(), atol=1e-6, rtol=0)
+    torch.testing.assert_close(hwl, torch.tensor([HWL]).double(), atol=1e-6, rtol=0)
+    rounded, _ = boxes_to_poses((corners * 100).round() / 100, convention, MOTION.get(convention))
+    torch.testing.assert_close(rounded, expected(), atol=0.02, rtol=0)
+
+
+# The same order and axes, or corners that make another standing box in the other frame.
+_BOXES_IN_BOTH = {
+    *(("kitti", "opencv"), ("opencv", "kitti"), ("kitti", "nuscenes"), ("opencv", "nuscenes"), ("nuscenes", "kitti")),
+    *(("nuscenes", "opencv"), ("mmdet3d_camera", "openpcdet"), ("mmdet3d_lidar", "mmdet3d_camera")),
+}
+
+
+@pytest.mark.parametrize(("written", "read"), [(a, b) for a in WRITTEN for b in WRITTEN])
+def test_corners_of_another_tool_are_told_by_its_name(written: BoxFormat, read: BoxFormat) -> None:
+    corners = tools_corners(written)[None]
+    if written == read or (written, read) in _BOXES_IN_BOTH:
+        boxes_to_poses(corners, read, MOTION.get(read))
+        return
+    with pytest.raises(InputError, match=f"in the order of '{read}'.*they are in the order of .*'{written}'"):
+        boxes_to_poses(corners, read, MOTION.get(read))
+
+
 @pytest.mark.parametrize("convention", WRITTEN)
 def test_shapes_and_motions_are_refused_in_the_words_of_the_convention(convention: BoxFormat) -> None:
     order = {
@@ -63,6 +123,32 @@ def test_shapes_and_motions_are_refused_in_the_words_of_the_convention(conventio
     inverse = right_one.inverse() if convention in MOTION else T_CAM_LIDAR
     with pytest.raises(InputError, match=rf"T_cam_boxes: expected the motion from the frame of '{convention}' boxes"):
         check_upright(inverse, convention)
+
+
+def test_corners_in_another_order_are_refused() -> None:
+    corners = tools_corners("kitti")[None]
+    shuffled = corners[:, [0, 2, 1, 3, 4, 5, 6, 7]]
+    with pytest.raises(InputError, match=r"boxes: expected corners in the order of 'kitti'.* in row 0"):
+        boxes_to_poses(shuffled, "kitti")
+    mirrored = corners[:, [4, 5, 6, 7, 0, 1, 2, 3]]
+    with pytest.raises(InputError, match="turned inside out"):
+        boxes_to_poses(mirrored, "kitti")
+    # A permutation of the axes makes a box again, with a car that lies on its side.
+    others: tuple[tuple[BoxFormat, BoxFormat], ...] = (
+        ("mmdet3d_camera", "kitti"),
+        ("kitti", "mmdet3d_camera"),
+        ("nuscenes", "mmdet3d_lidar"),
+    )
+    for written, read in others:
+        with pytest.raises(InputError, match=rf"in the order of '{read}', got .* on its side, in row 0"):
+            boxes_to_poses(tools_corners(written)[None], read, MOTION.get(written))
+
+
+def test_corners_of_no_box_make_no_pose_and_leave_the_others_alone() -> None:
+    box = tools_corners("kitti")
+    T_cam_obj, _ = boxes_to_poses(torch.stack([torch.full_like(box, torch.nan), box, 0 * box + 5.0]), "kitti")
+    assert T_cam_obj.isfinite().all(dim=2).all(dim=1).tolist() == [False, True, False]
+    torch.testing.assert_close(T_cam_obj[1:2], expected(), atol=1e-6, rtol=0)
 
 
 def test_lidar_boxes_need_the_motion_to_the_camera() -> None:

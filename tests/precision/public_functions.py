@@ -208,6 +208,7 @@ CASES: dict[str, Case] = {
     "box_formats.boxes_to_poses": lambda n: [
         *box_formats.boxes_to_poses(n.boxes, "kitti"),
         *box_formats.boxes_to_poses(n.boxes, "nuscenes", n.T_cam_lidar),
+        *box_formats.boxes_to_poses(box3d.box_corners(*box_formats.boxes_to_poses(n.boxes, "kitti")), "kitti"),
     ],
     "box_formats.poses_to_boxes": lambda n: [
         box_formats.poses_to_boxes(n.T, n.hwl, "opencv"),

@@ -63,6 +63,9 @@ def test_boxes_in_conventions_and_frames() -> None:
     torch.testing.assert_close(corners - result.corners("ref"), result.t_cam_ref[:, None].expand(-1, 8, -1))
     again = Detections.from_boxes(result.to_boxes("mmdet3d_camera"), "mmdet3d_camera", mask_left=torch.ones(2, 9, 9))
     torch.testing.assert_close(again.dimensions_hwl, boxes.dimensions_hwl)
+    from_corners = Detections.from_boxes(corners, "kitti", mask_left=torch.ones(2, 9, 9))
+    torch.testing.assert_close(from_corners.T_cam_obj[:, :3, :3], result.T_cam_obj[:, :3, :3], atol=1e-5, rtol=0)
+    torch.testing.assert_close(from_corners.dimensions_hwl, boxes.dimensions_hwl)
     with pytest.raises(InputError, match="T_cam_boxes: expected the rigid motion"):
         result.to_boxes("nuscenes")
     with pytest.raises(InputError, match="frame: expected 'cam' or 'ref', got 'world'"):
