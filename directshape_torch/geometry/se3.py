@@ -1,9 +1,9 @@
-"""This module holds rigid motions as matrices (*, 4, 4).
+"""This module holds rigid motions as matrices (*, 4, 4), and converts them to kornia's `Se3` and back.
 
 Twists are `(v, omega)`: metres, then radians, as in the paper's supplement (generators `G_0 .. G_5`) and in kornia.
 All functions broadcast over leading dimensions, keep dtype and device, and have finite values and gradients
 at the identity and near a rotation by pi. The module has what a solver's step needs; kornia has logarithm and adjoint,
-as in `Se3.from_matrix(T).log()`.
+as in `to_kornia(T).log()`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import torch
 from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
+from directshape_torch.errors import InputError
 from directshape_torch.numerics.full_precision import in_full_precision
 from directshape_torch.numerics.tensors import made_once
 
@@ -124,3 +125,41 @@ def transform(T_b_a: Tensor, points_a: Tensor) -> Tensor:
         torch.Size([5, 3])
     """
     return (T_b_a[..., :3, :3] @ points_a[..., None])[..., 0] + T_b_a[..., :3, 3]
+
+
+def from_kornia(motion: Se3) -> Tensor:
+    """Rigid transforms :math:`(*, 4, 4)` of kornia's `Se3`, say for `Detections.T_cam_obj`; metres.
+
+    The result is differentiable. An `Se3` made of plain tensors holds parameters, and then its matrix asks for a
+    gradient: detach it where none is wanted.
+
+    Raises:
+        InputError: the motion is no `Se3`.
+
+    Examples:
+        >>> from_kornia(Se3.trans_z(torch.tensor([20.0])))[0, :3, 3].detach()
+        tensor([ 0.,  0., 20.])
+    """
+    if not isinstance(motion, Se3):
+        raise InputError("motion", "kornia's Se3", type(motion).__name__, "matrices need no conversion")
+    return motion.matrix()
+
+
+@in_full_precision
+def to_kornia(T: Tensor) -> Se3:
+    """Rigid transforms :math:`(*, 4, 4)` as kornia's `Se3`, say of `RefinementResult.T_cam_obj`.
+
+    Gradients flow through it to `T`; where `T` asks for none, neither do the parameters of the `Se3`.
+
+    Raises:
+        InputError: the shape is not :math:`(*, 4, 4)`.
+
+    Examples:
+        >>> T = exp(torch.tensor([[1.0, -2.0, 0.5, 0.1, 0.2, -0.3]]))
+        >>> to_kornia(T).log()
+        tensor([[ 1.0000, -2.0000,  0.5000,  0.1000,  0.2000, -0.3000]])
+    """
+    if T.shape[-2:] != (4, 4):
+        raise InputError("T", "shape (*, 4, 4)", f"{tuple(T.shape)}", "build it with from_rotation_translation")
+    # The matrix is copied, because the parameters of the `Se3` may be moved and trained.
+    return Se3.from_matrix(T.clone()).requires_grad_(False)

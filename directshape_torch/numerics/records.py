@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple, Self, get_type_hints
 import torch
 from torch import Tensor
 
-from directshape_torch.errors import InputError
+from directshape_torch.errors import InputError, shown
 from directshape_torch.numerics.checks import FOLLOWING, Kind, check_alike, check_shape
 
 
@@ -212,15 +212,58 @@ class CarRecord(Record):
         return self._with(replaced, others, by_row=True)
 
     def state_dict(self, prefix: str = "") -> dict[str, Tensor]:
-        """All tensors by flat names, for `torch.save` and safetensors."""
+        """All tensors and words by flat names, for `torch.save` and safetensors; words become UTF-8 bytes."""
         state: dict[str, Tensor] = {}
         for each in fields(self):  # type: ignore[arg-type]
             value, name = getattr(self, each.name), prefix + each.name
             if isinstance(value, CarRecord):
                 state |= value.state_dict(f"{name}.")
+            elif isinstance(value, tuple):
+                state[name] = torch.tensor(list("\n".join(value).encode()), dtype=torch.uint8)
+            elif isinstance(value, bool):
+                state[name] = torch.tensor(value)
             elif isinstance(value, Tensor):
                 state[name] = value.detach().clone(memory_format=torch.contiguous_format)
         return state
+
+    @classmethod
+    def _from_state(
+        cls, state: Mapping[str, Tensor], prefix: str = "", sizes: dict[int | str, int] | None = None, **others: Any
+    ) -> Self:
+        """The record whose `state_dict` is `state`; `others` are the fields that `state` does not hold.
+
+        Raises:
+            InputError: a value is missing or is not what its field declares.
+        """
+        values, sizes = dict(others), {} if sizes is None else sizes
+        for field, kind in cls._hints().items():
+            name = prefix + field
+            called = f"state[{name!r}]"
+            if field in others:
+                continue
+            if isinstance(kind, type) and issubclass(kind, CarRecord):
+                values[field] = kind._from_state(state, f"{name}.", sizes)
+            elif name not in state:
+                raise InputError("state", f"the tensor {name!r}", f"{len(state)} others", "save result.state_dict()")
+            elif kind is bool:
+                check_shape(called, state[name], ())
+                values[field] = bool(state[name])
+            elif hasattr(kind, "__metadata__"):
+                kind.__metadata__[0].check(called, state[name], sizes)
+                values[field] = state[name]
+            else:
+                values[field] = _words(called, state[name])
+        return cls(**values)
+
+
+def _words(name: str, letters: Tensor) -> tuple[str, ...]:
+    """Words of one line each, from their UTF-8 bytes."""
+    check_shape(name, letters, ("n",))
+    try:
+        text = bytes(letters.tolist()).decode()
+    except (TypeError, ValueError) as error:  # some numbers are no bytes, or some bytes are no letters
+        raise InputError(name, "UTF-8 bytes", shown(letters.tolist()), "save result.state_dict()") from error
+    return tuple(text.split("\n")) if text else ()
 
 
 def kept(values: Tensor, condition: Tensor) -> Tensor:

@@ -81,6 +81,11 @@ class DisparityProfile(CarRecord):
     num_pixels: Annotated[Tensor, Dense("B")]
     halves_apart: Annotated[Tensor, Dense("B")]
 
+    def cost_at(self, offset_px: float) -> tuple[Tensor, Tensor]:
+        """Costs (B,) of both curves at the sample nearest to an offset."""
+        column = (self.offsets_px - offset_px).abs().argmin(dim=0, keepdim=True)
+        return self.cost_before.index_select(1, column)[:, 0], self.cost_after.index_select(1, column)[:, 0]
+
     @property
     def before(self) -> ProfileFigures:
         """Figures of the curve at the input."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from numbers import Integral
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
@@ -14,10 +14,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from directshape_torch.errors import InputError, shown
+from directshape_torch.errors import InputError, MissingDependencyError, shown
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, box_corners, rotation_y_from_pose
 from directshape_torch.geometry.box_formats import BoxFormat, poses_to_boxes
+from directshape_torch.numerics.checks import check_alike
 from directshape_torch.numerics.conversion import working_dtype
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.records import CarRecord, Dense
@@ -25,6 +26,7 @@ from directshape_torch.refinement.disparity_profile import DisparityProfile
 from directshape_torch.refinement.fusion import DetectorComparison, level_boxes
 from directshape_torch.refinement.observability import Observability
 from directshape_torch.refinement.quality import FitQuality, is_front_known
+from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.shape.zero_level import sdf_to_mesh
 from directshape_torch.status import Status, counted, is_refined
@@ -173,6 +175,28 @@ class RefinementResult(CarRecord):
         arrays = {name: np.array(each, dtype=np.str_) for name, each in words.items()}
         return {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()} | arrays
 
+    @classmethod
+    def from_state_dict(cls, state: Mapping[str, Tensor], prior: ShapePrior | None = None) -> Self:
+        """The result whose `state_dict()` this is, read back by `torch.load(weights_only=True)` or safetensors.
+
+        Args:
+            state: the tensors by their names.
+            prior: the shapes of the result, which its state does not hold. Default: the bundled shapes.
+
+        Raises:
+            InputError: a tensor is missing or none of its kind, the prior has another number of codes, or a refined car
+                has no finite box and standard deviations.
+        """
+        shapes = PCAShapePrior.load_bundled() if prior is None else prior
+        result = cls._from_state(state, prior=shapes)
+        if result.code.shape[1] != shapes.num_codes:
+            expected = f"the prior of the result, with {result.code.shape[1]} codes"
+            raise InputError("prior", expected, f"one with {shapes.num_codes}", "give the prior of the refiner")
+        _check_state(result)
+        result = replace(result, prior=_moved_prior(shapes, result.T_cam_obj))
+        _check_refined(result.detach())
+        return result
+
     def __repr__(self) -> str:
         """Print counts of the statuses, the meaning of each refusing status, and a table of up to 40 cars.
 
@@ -307,12 +331,50 @@ class RefinementResult(CarRecord):
         values = self.prior.values(self.code[index][None])[0]
         return sdf_to_mesh(values, self.prior.origin, self.prior.spacing_m, T_cam_obj=self.T_cam_obj[index])
 
-    def meshes(self) -> list[trimesh.Trimesh]:
-        """Surfaces of all cars in the left camera frame; no gradients flow into meshes.
+    def meshes(self, kind: Literal["trimesh", "pytorch3d"] = "trimesh") -> Any:
+        """Surfaces of all cars in the left camera frame: a list of `trimesh.Trimesh`, or one PyTorch3D `Meshes`.
 
-        Cars that were not refined have the mean shape, at the pose of the detector.
+        Cars that were not refined have the mean shape, at the pose of the detector. No gradients flow into meshes.
+
+        Raises:
+            InputError: another kind.
+            MissingDependencyError: PyTorch3D is asked for and not installed.
         """
-        return [self.mesh(row) for row in range(len(self))]
+        if kind == "trimesh":
+            return [self.mesh(row) for row in range(len(self))]
+        if kind != "pytorch3d":
+            raise InputError("kind", "'trimesh' or 'pytorch3d'", repr(kind))
+        try:
+            from pytorch3d.structures import Meshes
+        except ImportError as error:
+            raise MissingDependencyError("pytorch3d", "", 'meshes("pytorch3d")') from error
+        like, surfaces = self.T_cam_obj, self.meshes()
+        return Meshes(
+            verts=[torch.as_tensor(np.array(mesh.vertices)).to(like) for mesh in surfaces],
+            faces=[torch.as_tensor(np.array(mesh.faces)).long().to(like.device) for mesh in surfaces],
+        )
+
+
+def _check_state(result: RefinementResult) -> None:
+    """Raise `InputError` for words, dtypes or statuses that do not fit; shapes of tensors are checked elsewhere."""
+    for name in ("code", "input_dimensions_hwl", "t_cam_ref"):
+        check_alike(f"state['{name}']", getattr(result, name), "state['T_cam_obj']", result.T_cam_obj)
+    words = {"term_names": result.cost_after.shape[1], "ground_source": len(result)}
+    for name, count in words.items():
+        if len(getattr(result, name)) != count:
+            raise InputError(f"state[{name!r}]", f"{count} words", f"{len(getattr(result, name))}")
+    if bool(((result.status_code < 0) | (result.status_code >= len(Status))).any()):
+        raise InputError("state['status_code']", f"numbers of 0..{len(Status) - 1}", f"{result.status_code.tolist()}")
+
+
+def _check_refined(result: RefinementResult) -> None:
+    """Raise `InputError` unless refined cars have finite figures, as results of the refiner do."""
+    figures = (result.code, result.cost_after, *vars(result.boxes()).values(), result.covariance, result.sigma_xyz_yaw)
+    finite = torch.stack([x[:, None].isfinite().flatten(1).all(dim=1) for x in figures]).all(dim=0)
+    wrong = (result.refined & ~finite).nonzero().flatten().tolist()
+    if wrong:
+        expected = "finite boxes and standard deviations of refined cars"
+        raise InputError("state", expected, f"none of cars {wrong}", "save result.state_dict() with its own prior")
 
 
 def _chosen_rows(index: object, count: int) -> Tensor:

@@ -173,6 +173,7 @@ def calls() -> dict[str, Call]:
         ),
         "fit shape": Call({"points": points, "boxes": boxes, "convention": "opencv", "prior": prior}, _fit),
         "check scene": Call(street | {"match_images": False}, lambda a: [torch.tensor(len(str(check_scene(**a))))]),
+        "state": Call(dict(_result().state_dict()), lambda a: _of_refined(_loaded(a)), promises=True),
         "some cars": Call({"index": torch.tensor([True, False])}, lambda a: [_result()[a["index"]].T_cam_obj]),
         "words": Call({"convention": "kitti", "frame": "cam"}, lambda a: [_result().to_boxes(**a)]),
         "rig state": Call({"state": RigEstimate.of_frames(frames).get_extra_state()}, _rig_state),
@@ -220,6 +221,10 @@ def _of_refined(result: RefinementResult) -> list[Tensor]:
     boxes, used = result.boxes(), result.refined
     found = (result.T_cam_obj, result.code, result.covariance, result.sigma_xyz_yaw, result.cost_after)
     return [x[used] for x in (*found, boxes.dimensions_hwl, boxes.location_ref, boxes.rotation_y)]
+
+
+def _loaded(a: Arguments) -> RefinementResult:
+    return RefinementResult.from_state_dict(a, cached_street()[0])
 
 
 def _gradient(a: Arguments) -> list[Tensor]:

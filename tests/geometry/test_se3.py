@@ -11,6 +11,7 @@ from kornia.geometry.liegroup import Se3, So3
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
+from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 
 AXIS = torch.tensor([0.6, -0.48, 0.64], dtype=torch.float64)
@@ -110,11 +111,11 @@ def test_a_known_largest_angle_changes_no_result(angle: float) -> None:
 
 @pytest.mark.parametrize("regime", REGIMES)
 @pytest.mark.parametrize(("dtype", "atol"), [(torch.float64, 1e-14), (torch.float32, 2e-6)])
-def test_agrees_with_kornia(regime: str, dtype: torch.dtype, atol: float) -> None:
+def test_there_and_back_by_kornia(regime: str, dtype: torch.dtype, atol: float) -> None:
     twist = twists(regime, dtype=dtype)
     T = se3.exp(twist)
-    theirs = Se3.from_matrix(T)
-    torch.testing.assert_close(theirs.matrix(), T, atol=atol, rtol=0)
+    theirs = se3.to_kornia(T)
+    torch.testing.assert_close(se3.from_kornia(theirs), T, atol=atol, rtol=0)
     torch.testing.assert_close(Se3.exp(twist).matrix(), T, atol=10 * atol, rtol=0)
     torch.testing.assert_close(se3.exp(theirs.log()), T, atol=10 * atol, rtol=0)
     # The quaternion has its real part first, and the tangent its translation.
@@ -123,3 +124,30 @@ def test_agrees_with_kornia(regime: str, dtype: torch.dtype, atol: float) -> Non
     torch.testing.assert_close(theirs.quaternion.data[:, 0].abs(), half_angle.cos(), atol=atol, rtol=0)
     if dtype == torch.float64:
         torch.testing.assert_close(theirs.log(), twist, atol=1e-12, rtol=1e-12)
+
+
+def test_gradients_flow_where_they_are_asked_for() -> None:
+    T = se3.exp(twists("normal", 3))
+    theirs = se3.to_kornia(T)
+    assert not se3.from_kornia(theirs).requires_grad
+    theirs.translation.add_(1)
+    torch.testing.assert_close(T, se3.exp(twists("normal", 3)), atol=0, rtol=0)
+
+    twist = twists("normal", 3).requires_grad_()
+    assert gradcheck(lambda d: se3.to_kornia(se3.exp(d)).log(), twist)
+    assert gradcheck(lambda d: se3.from_kornia(Se3.exp(d)), twist)
+
+
+def test_a_car_without_a_pose_stays_without_one() -> None:
+    T = torch.eye(4).repeat(2, 1, 1)
+    T[0, :3] = torch.nan
+    back = se3.from_kornia(se3.to_kornia(T))
+    assert back[0, :3].isnan().all()
+    assert torch.equal(back[1], T[1])
+
+
+def test_wrong_input_is_named() -> None:
+    with pytest.raises(InputError, match=r"motion: expected kornia's Se3, got Tensor"):
+        se3.from_kornia(torch.eye(4))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"T: expected shape \(\*, 4, 4\), got \(3, 4\)"):
+        se3.to_kornia(torch.zeros(3, 4))

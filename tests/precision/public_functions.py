@@ -137,6 +137,10 @@ def result() -> RefinementResult:
     return found
 
 
+def read_back() -> RefinementResult:
+    return RefinementResult.from_state_dict(result().state_dict(), grids())
+
+
 def estimate() -> RigEstimate:
     made = RigEstimate.of_frames(street()[0])
     made.update(*street())
@@ -191,6 +195,8 @@ CASES: dict[str, Case] = {
     "se3.inverse": lambda n: se3.inverse(n.T),
     "se3.transform": lambda n: se3.transform(n.T[0], n.points),
     "se3.from_rotation_translation": lambda n: se3.from_rotation_translation(n.T[:, :3, :3], n.points[:2]),
+    "se3.to_kornia": lambda n: se3.to_kornia(n.T).matrix(),
+    "se3.from_kornia": lambda n: se3.from_kornia(se3.to_kornia(n.T)),
     "projection.rays_from_pixels": lambda n: projection.rays_from_pixels(n.uv, n.K),
     "projection.project": lambda n: projection.project(n.points, n.K),
     "stereo_depth.warp_to_right": lambda n: stereo_depth.warp_to_right(n.points, n.depth, n.K, n.T_right_cam, n.depth),
@@ -259,6 +265,7 @@ CASES: dict[str, Case] = {
     "RefinementResult.mesh": lambda _: result().mesh(0).vertices,
     "RefinementResult.meshes": lambda _: [mesh.vertices for mesh in result().meshes()],
     "RefinementResult.numpy": lambda _: {k: v for k, v in result().numpy().items() if v.dtype.kind == "f"},
+    "RefinementResult.from_state_dict": lambda _: read_back().state_dict(),
     "Observability.words": lambda _: "".join(result().observability.words()),
     "DisparityProfile.after": lambda _: result().profile.after,
     "DisparityProfile.before": lambda _: result().profile.before,
@@ -271,6 +278,7 @@ CASES: dict[str, Case] = {
     "RigEstimate.offset_at": lambda n: estimate().offset_at(n.uv),
     "RigEstimate.corrected": lambda n: estimate().corrected(street()[0]).camera.disparity_field.bias(n.uv),
     "RigEstimate.informed": lambda _: tensors(estimate().informed(estimate().corrected(street()[0]), street()[1])),
+    "DisparityProfile.cost_at": lambda _: result().profile.cost_at(0.5),
     "RigEstimate.add_rows": lambda _: with_rows(torch.full((1, 8), 7.3, dtype=torch.float32)).mean,
     "RigEstimate.add_sizes": lambda _: with_sizes(torch.full((1, 8), 7.3, dtype=torch.float32)).mean,
     "RigEstimate.uv_of_cars": lambda _: estimate().uv_of_cars,

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import sys
 from dataclasses import replace
 from functools import lru_cache
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from directshape_torch import (
     Detections,
     DirectShapeRefiner,
     InputError,
+    MissingDependencyError,
     RefinementResult,
 )
 from directshape_torch.status import Status
@@ -91,17 +94,47 @@ def test_results_move_and_give_arrays() -> None:
 
 
 def test_results_are_stored_without_pickles() -> None:
-    state = refined().state_dict()
+    result = refined()
+    state = result.state_dict()
     buffer = io.BytesIO()
     torch.save(state, buffer)
     buffer.seek(0)
     for read in (torch.load(buffer, weights_only=True), load(save(state))):
-        assert read.keys() == state.keys()
-        assert all(read[name].equal(value) or value.isnan().any() for name, value in state.items())
+        again = RefinementResult.from_state_dict(read, PRIOR)
+        assert again.state_dict().keys() == state.keys()
+        assert all(again.state_dict()[name].equal(value) or value.isnan().any() for name, value in state.items())
+        assert again.status == result.status
+        assert (again.term_names, again.ground_source) == (result.term_names, result.ground_source)
+        torch.testing.assert_close(again.boxes().location_ref, result.boxes().location_ref)
+    assert RefinementResult.from_state_dict(result[:0].state_dict(), PRIOR).ground_source == ()
+    with pytest.raises(InputError, match=r"state: expected the tensor 'quality\.evidence'"):
+        RefinementResult.from_state_dict({k: v for k, v in state.items() if k != "quality.evidence"}, PRIOR)
+    with pytest.raises(InputError, match=r"prior: expected the prior of the result, with \d codes"):
+        RefinementResult.from_state_dict(replace(result, code=result.code[:, :1]).state_dict(), PRIOR)
+    covariance = torch.eye(4, dtype=torch.float64).expand(len(result), 4, 4).clone()
+    covariance[1, 0, 0] = -1.0  # of nothing
+    for wrong in ({"code": 0 * result.code + 1e9}, {"covariance_xyz_yaw": covariance}):
+        with pytest.raises(InputError, match=r"state: expected finite boxes .*, got none of cars \[.*1"):
+            RefinementResult.from_state_dict(state | wrong, PRIOR)
 
 
-def test_meshes_of_all_cars() -> None:
-    assert [mesh.is_watertight for mesh in refined().meshes()] == [True, True]
+def test_meshes_of_all_cars(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = refined()
+    surfaces = result.meshes()
+    assert [mesh.is_watertight for mesh in surfaces] == [True, True]
+    monkeypatch.setitem(sys.modules, "pytorch3d", None)
+    with pytest.raises(MissingDependencyError, match="needs the package 'pytorch3d'"):
+        result.meshes("pytorch3d")
+    structures = ModuleType("pytorch3d.structures")
+    structures.Meshes = lambda verts, faces: SimpleNamespace(verts=verts, faces=faces)  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "pytorch3d", ModuleType("pytorch3d"))
+    monkeypatch.setitem(sys.modules, "pytorch3d.structures", structures)
+    batch = result.meshes("pytorch3d")
+    assert [len(vertices) for vertices in batch.verts] == [len(mesh.vertices) for mesh in surfaces]
+    assert batch.verts[0].dtype == torch.float64
+    assert batch.faces[0].dtype == torch.int64
+    with pytest.raises(InputError, match="kind: expected 'trimesh' or 'pytorch3d'"):
+        result.meshes("blender")  # type: ignore[arg-type]
 
 
 def test_a_result_prints_all_of_its_cars() -> None:
