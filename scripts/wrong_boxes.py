@@ -29,7 +29,7 @@ from directshape_torch.geometry.box3d import rotation_about_y
 from directshape_torch.geometry.box_formats import poses_to_boxes
 from directshape_torch.io.config_files import load_config
 from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
-from directshape_torch.refinement.rescue import LARGEST_SHARE_GOING_ON
+from directshape_torch.refinement.lost_cars import LARGEST_SHARE_GOING_ON
 from directshape_torch.refinement.trust import WORSE_BY
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.start.mask_border import share_going_on

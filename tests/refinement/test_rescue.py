@@ -13,7 +13,7 @@ from torch import Tensor
 from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, RefinementResult, load_config
 from directshape_torch.geometry.box3d import rotation_about_y, rotation_y_from_pose
 from directshape_torch.laboratory.scenes import LaboratoryScene, load_scene
-from directshape_torch.refinement import rescue
+from directshape_torch.refinement import lost_cars
 from directshape_torch.status import Status
 
 load_scene = cache(load_scene)
@@ -92,7 +92,7 @@ def test_cars_that_are_not_lost_cost_no_disparity(monkeypatch: pytest.MonkeyPatc
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr(rescue, "with_disparity", refuse)
+    monkeypatch.setattr(lost_cars, "with_disparity", refuse)
     scene = load_scene()
     assert refined(scene.frame, cars(scene, 1, 2)).refined.all()
     with pytest.raises(AssertionError):
