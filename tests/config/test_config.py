@@ -178,9 +178,6 @@ def test_unreadable_files_and_overrides(tmp_path: Path, content: str, overrides:
     with pytest.raises(ConfigError) as error:
         load_config(path, overrides)
     assert text in str(error.value)
-
-
-def test_a_missing_file_is_an_error_of_this_package(tmp_path: Path) -> None:
     with pytest.raises(DirectShapeError, match=r"none\.yaml: cannot be read"):
         load_config(tmp_path / "none.yaml")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import runpy
 from itertools import pairwise
 from pathlib import Path
@@ -24,10 +23,6 @@ def keys(mapping: Any, prefix: str = "") -> set[str]:
     if not isinstance(mapping, dict):
         return {prefix}
     return {key for name, value in mapping.items() for key in keys(value, f"{prefix}.{name}")}
-
-
-def test_default_is_what_the_code_uses() -> None:
-    assert load_config(CONFIGS / "default.yaml") == RefinerConfig()
 
 
 @pytest.mark.parametrize("name", BUNDLED_CONFIGS)
@@ -80,13 +75,3 @@ def test_paper_anneals_the_contour_by_a_factor_of_07() -> None:
     assert widths[0] == 4 * widths[-1] == 1.0
     for softer, sharper in pairwise(widths[:-1]):
         assert sharper == pytest.approx(0.7 * softer, abs=1e-3)
-
-
-def test_paper_names_an_option_that_exists_for_each_deviation() -> None:
-    text = (CONFIGS / "paper.yaml").read_text(encoding="utf-8")
-    header = text[: text.index("\ncompile:")]
-    known = keys(config_to_mapping(RefinerConfig()))
-    named = set(re.findall(r"\b(?:photometric|silhouette|sampling|solver|priors)\.(?!md)[a-z_]+(?:\*)?", header))
-    assert len(named) >= 6
-    for name in named:
-        assert any(key == f".{name}" or (name.endswith("*") and key.startswith(f".{name[:-1]}")) for key in known), name

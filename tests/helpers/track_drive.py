@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.refinement import make_result
 from directshape_torch.refinement import refined as refinements
 from directshape_torch.refinement.problem import CarMinimum
@@ -33,6 +34,8 @@ from helpers.synthetic_scene import (
 )
 
 HEADINGS = (0.3, 1.2, 2.4)
+# A few steps are enough to tell results apart.
+QUICK = replace(DEFAULT, stages=(StageConfig(2.0, 1, 2), StageConfig(0.5, 0, 3)))
 
 
 @cache
@@ -51,9 +54,14 @@ def drive(contrast: float = 1.0) -> tuple[FrameBatch, Detections, Tensor]:
     return frames, replace(disturbed(detections), dimensions_hwl=mean), code.repeat(len(seen), 1)
 
 
-def refined(detections: Detections, track_id: list[int] | None = None, contrast: float = 1.0) -> RefinementResult:
+def refined(
+    detections: Detections,
+    track_id: list[int] | None = None,
+    contrast: float = 1.0,
+    config: RefinerConfig = QUICK,
+) -> RefinementResult:
     ids = None if track_id is None else torch.tensor(track_id)
-    return DirectShapeRefiner(ellipsoid_prior(), DEFAULT)(drive(contrast)[0], replace(detections, track_id=ids))
+    return DirectShapeRefiner(ellipsoid_prior(), config)(drive(contrast)[0], replace(detections, track_id=ids))
 
 
 @cache

@@ -17,7 +17,10 @@ def _bench_of(regime: str) -> Bench:
     return Bench.build(load_scene(), PCAShapePrior.load_bundled().double(), REGIMES[regime], 3, pixels_per_car=100)
 
 
-@pytest.fixture(params=REGIMES)
+SHORT = ("typical", "near_3m", "far_80m", "grazing", "contour", "grid_border", "track")
+
+
+@pytest.fixture(params=[pytest.param(name, marks=[] if name in SHORT else pytest.mark.long) for name in REGIMES])
 def bench(request: pytest.FixtureRequest) -> Bench:
     """Three states of each regime in turn, float64."""
     return _bench_of(request.param)

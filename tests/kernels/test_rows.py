@@ -172,16 +172,11 @@ def test_the_fisher_matrix_is_the_matrix_of_the_products_where_nobody_asks_for_i
     assert not torch.equal(with_fisher.information, without.information)
 
 
-def test_double_precision_and_other_settings_of_the_silhouette_take_tensor_operations(typical: Bench) -> None:
-    rows = rows_of(typical, "silhouettes")
-    assert rows.term.native_part(*rows[1:], fisher=True) is None
-    product = in_single(rows_of(typical, "silhouettes_product"))
-    assert product.term.native_part(*product[1:], fisher=True) is None
-
-
 @pytest.mark.parametrize("name", NAMES)
-def test_a_subclass_takes_tensor_operations(typical: Bench, name: str) -> None:
-    rows = in_single(rows_of(typical, name))
+def test_double_precision_and_a_subclass_take_tensor_operations(typical: Bench, name: str) -> None:
+    double = rows_of(typical, name)
+    assert double.term.native_part(*double[1:], fisher=True) is None
+    rows = in_single(double)
     changed = object.__new__(type("Changed", (type(rows.term),), {}))
     vars(changed).update(vars(rows.term))
     assert changed.native_part(*rows[1:], fisher=True) is None

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from helpers.problems import begun_stage, photometric_of
+from helpers.problems import begun_stage
 from helpers.synthetic_scene import cached_street
 from torch import Tensor
 
 from directshape_torch.refinement.disparity_profile import disparity_profile
-from directshape_torch.refinement.quality import FitQuality, fit_quality, photometric_agreement
+from directshape_torch.refinement.quality import FitQuality, fit_quality
 from directshape_torch.refinement.trust import EVIDENCE_NAMES
 from directshape_torch.scene.frames import FrameBatch
 
@@ -52,21 +52,3 @@ def test_columns_by_hand_and_a_car_that_is_not_there_is_not_better() -> None:
     torch.testing.assert_close(found.probability_not_worse, 0.5 * found.probability_better)
     near, far = (quality(distance * ones, (ones, ones)).probability_better for distance in (2.0, 8.0))
     assert (far < near - 0.05).all()
-
-
-def test_the_contrast_is_the_deviation_within_neighbourhoods() -> None:
-    prior, scene = cached_street()
-    stage, state = begun_stage(prior, scene.frames, scene.detections)
-    term, at = photometric_of(stage), stage.photometric_part(stage.figures(stage.problem.prepare(state)))
-    assert at is not None
-    error, _, contrast = photometric_agreement(term, at)
-    rows = term.pixel_set.rows
-    usable = at.anchor.usable & (rows.pixel_weight > 0)
-    for car in range(2):
-        mine = usable & (term.pixel_set.blocks.owner == car)[:, None]
-        weight, grey = rows.neighbour_weight.movedim(0, -1)[mine], rows.intensity_left.movedim(0, -1)[mine]
-        mean = (weight * grey).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
-        torch.testing.assert_close(
-            contrast[car], (weight * (grey - mean).abs()).sum() / weight.sum(), rtol=1e-9, atol=0
-        )
-    assert (contrast > error).all()

@@ -67,13 +67,18 @@ def test_photometric_agreement_is_the_mean_over_the_usable_pixels_car_by_car() -
     for at in (state, CarState.of(T, state.code)):
         rows = stage.photometric_part(figures_at(stage, at))
         assert rows is not None
-        error, share, _ = photometric_agreement(term, rows)
+        error, share, contrast = photometric_agreement(term, rows)
         for car in range(2):
             in_set = (fixed.rows.pixel_weight > 0) & (fixed.blocks.owner == car)[:, None]
             usable = in_set & rows.anchor.usable
             weight = fixed.rows.neighbour_weight.movedim(0, -1)[usable]
             expected = (weight * rows.residual[usable].abs()).sum() / weight.sum()
             torch.testing.assert_close(error[car], expected, rtol=1e-9, atol=0)
+            # The contrast is the deviation within neighbourhoods.
+            grey = fixed.rows.intensity_left.movedim(0, -1)[usable]
+            mean = (weight * grey).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
+            expected = (weight * (grey - mean).abs()).sum() / weight.sum()
+            torch.testing.assert_close(contrast[car], expected, rtol=1e-9, atol=0)
             torch.testing.assert_close(share[car], usable.sum() / in_set.sum().double(), rtol=1e-12, atol=0)
 
 

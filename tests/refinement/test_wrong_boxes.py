@@ -51,11 +51,11 @@ def test_boxes_and_masks_of_another_image_show_no_car() -> None:
     scene = load_scene()
     refiner = DirectShapeRefiner(config=load_config("default")).to(scene.detections.T_cam_obj.dtype)
     num_refined = 0
-    for shift_px in (150, 250, 330, 420, 520, 600):
+    for shift_px in (150, 330, 520):
         images = {side: getattr(scene.frame, side).roll(shift_px, dims=3) for side in ("images_left", "images_right")}
         result: RefinementResult = refiner(replace(scene.frame, **images), scene.detections)
         num_refined += int(result.refined.sum())
-    assert num_refined <= 10, "of 36; without a look at where their pixels match best 18"
+    assert num_refined <= 5, f"{num_refined} of 18"
 
 
 def test_masks_of_other_cars_are_refused_by_name() -> None:

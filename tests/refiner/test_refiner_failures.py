@@ -223,9 +223,6 @@ def test_half_precision_is_refused(dtype: torch.dtype) -> None:
 def test_settings_that_are_none_name_the_cure(config: object, cure: str) -> None:
     with pytest.raises(InputError, match=r"config: expected a RefinerConfig, .*" + cure):
         DirectShapeRefiner(config=config)  # type: ignore[arg-type]
-
-
-def test_settings_in_the_place_of_the_prior_are_named() -> None:
     with pytest.raises(InputError, match=r"prior: expected a ShapePrior, got RefinerConfig; pass it as config="):
         DirectShapeRefiner(DEFAULT)  # type: ignore[arg-type]
 
@@ -255,13 +252,6 @@ def test_what_the_caller_writes_into_his_dimensions_is_not_in_the_result() -> No
     before = result.input_dimensions_hwl.clone()
     detections.dimensions_hwl.zero_()
     assert torch.equal(result.input_dimensions_hwl, before)
-
-
-def test_frames_may_be_numbered_in_32_bits() -> None:
-    frames, detections = base()
-    frames = replace(frames, sizes=frames.sizes.int())
-    result = refine(frames, replace(detections, frame_index=detections.frame_index.int()))
-    assert torch.equal(result.T_cam_obj, healthy().T_cam_obj)
 
 
 @pytest.mark.parametrize("frames_too", [False, True])

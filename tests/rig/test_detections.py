@@ -35,6 +35,13 @@ def demo() -> LoadedFrame:
     return with_true_boxes()
 
 
+@pytest.fixture(scope="module")
+def exact(demo: LoadedFrame) -> Tensor:
+    """What the true boxes show of the frame as it is."""
+    rows: Tensor = observe_detections(demo.frame, demo.detections)
+    return rows
+
+
 def warped(frames: FrameBatch, disparity_px: float, rows_px: float) -> FrameBatch:
     """The frame with the right image moved to the left and down by given amounts."""
     height, width = frames.images_right.shape[-2:]
@@ -57,8 +64,7 @@ def difference(rows: Tensor, column: int, before: Tensor) -> float:
     return float((rows[:, column].median() - before[:, column].median()).abs())
 
 
-def test_true_boxes_see_what_the_right_image_is_warped_by(demo: LoadedFrame) -> None:
-    exact = observe_detections(demo.frame, demo.detections)
+def test_true_boxes_see_what_the_right_image_is_warped_by(demo: LoadedFrame, exact: Tensor) -> None:
     assert len(exact) >= 4
     assert float(exact[:, OFFSET].median().abs()) < 0.25
     seen = observe_detections(warped(demo.frame, 0.8, 0.3), demo.detections)
@@ -73,8 +79,7 @@ def with_other_principal_point(frames: FrameBatch, by_px: float) -> FrameBatch:
     return replace(warped(frames, by_px, 0.0), camera=replace(frames.camera, K_right=K_right))
 
 
-def test_principal_points_that_differ_change_no_observation(demo: LoadedFrame) -> None:
-    exact = observe_detections(demo.frame, demo.detections)
+def test_principal_points_that_differ_change_no_observation(demo: LoadedFrame, exact: Tensor) -> None:
     moved = observe_detections(with_other_principal_point(demo.frame, 40.0), demo.detections)
     for column in (DISPARITY, OFFSET):
         assert difference(moved, column, exact) < 0.1
@@ -102,7 +107,7 @@ def test_a_box_beyond_all_numbers_has_no_size_in_the_image(row: int) -> None:
     assert size_error(T_cam_obj, dimensions_hwl, mask, K) == 0
 
 
-def test_padding_of_a_batch_changes_no_observation(demo: LoadedFrame) -> None:
+def test_padding_of_a_batch_changes_no_observation(demo: LoadedFrame, exact: Tensor) -> None:
     height, width = demo.frame.images_left.shape[-2:]
     pad = {
         name: torch.nn.functional.pad(getattr(demo.frame, name), (0, 31, 0, 17))
@@ -112,15 +117,14 @@ def test_padding_of_a_batch_changes_no_observation(demo: LoadedFrame) -> None:
         name: getattr(demo.detections, name).padded((height + 17, width + 31)) for name in ("mask_left", "mask_right")
     }
     padded = observe_detections(replace(demo.frame, **pad), replace(demo.detections, **masks))
-    assert padded.equal(observe_detections(demo.frame, demo.detections))
+    assert padded.equal(exact)
 
 
-def test_without_masks_the_boxes_themselves_are_looked_at(demo: LoadedFrame) -> None:
-    with_masks = observe_detections(demo.frame, demo.detections)
+def test_without_masks_the_boxes_themselves_are_looked_at(demo: LoadedFrame, exact: Tensor) -> None:
     blind = masked(demo.detections, torch.zeros(len(demo.detections), dtype=torch.bool))
     without = observe_detections(demo.frame, blind)
     assert len(without) >= 3
-    assert difference(without, OFFSET, with_masks) < 0.3
+    assert difference(without, OFFSET, exact) < 0.3
 
 
 def test_the_refiner_corrects_frames_by_its_rig(demo: LoadedFrame) -> None:
@@ -141,9 +145,9 @@ def test_the_refiner_corrects_frames_by_its_rig(demo: LoadedFrame) -> None:
             use(other)
 
 
-def test_what_an_estimate_of_few_cars_says_gives_way_to_settings_and_points(demo: LoadedFrame) -> None:
+def test_what_an_estimate_of_few_cars_says_gives_way_to_settings_and_points(demo: LoadedFrame, exact: Tensor) -> None:
     rig = RigEstimate.of_frames(demo.frame)
-    rig.update(demo.frame, demo.detections)
+    rig.add_rows(exact)
     matched = with_disparity(demo.frame)
     frames, plain = rig.corrected(matched), demo.detections.rows(torch.arange(2))
     informed = rig.informed(frames, plain)

@@ -35,7 +35,7 @@ def true_offset(uv: Tensor) -> Tensor:
 def test_errors_are_as_large_as_the_estimate_says() -> None:
     """Standardised errors of offset, bias and noise over draws of 60 detections."""
     offsets, biases, noises = [], [], []
-    for seed in range(50):
+    for seed in range(25):
         rig = estimate(rows_of_cars(60, seed, bias=-0.02))
         mean, sigma = rig.offset_at(PLACES)
         offsets.append((mean - true_offset(PLACES)) / sigma)

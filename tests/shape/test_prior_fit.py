@@ -8,7 +8,7 @@ from parametric_cars.measures import sample_car
 from parametric_cars.surfaces import car_sdf
 
 from directshape_torch.errors import InputError
-from directshape_torch.shape.mesh_to_sdf import GridSpec, load_mesh_obj, mesh_to_sdf
+from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
 from directshape_torch.shape.pca_fit import fit_car, fit_pca, leave_one_out_errors_cm
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.prior_file import PriorProvenance
@@ -74,7 +74,7 @@ def test_bundled_prior_takes_on_a_real_saloon():
     if root is None:
         pytest.skip("DIRECTSHAPE_DATA is not set: no real meshes at hand")
     file = Path(root) / "meshes" / "comrade1280" / "sedan.obj"
-    sdf = torch.from_numpy(mesh_to_sdf(load_mesh_obj(file), GridSpec.for_cars()))
+    sdf = torch.from_numpy(mesh_to_sdf(load_mesh_obj(file), GridSpec.for_cars(), MeshOptions(voxel_m=0.04)))
     prior = PCAShapePrior.load_bundled()
     assert fit_car(first_components(prior, 5), sdf)[1] < 3.0
     assert fit_car(prior, sdf)[1] < 2.8

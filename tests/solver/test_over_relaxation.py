@@ -135,17 +135,6 @@ def test_a_step_that_promises_ten_times_what_counts_as_little_is_not_the_end(pro
     assert (result.iterations.tolist() == [2]) is is_the_end
 
 
-def test_two_steps_in_a_row_that_overshoot_are_not() -> None:
-    problem = ResidualProblem(
-        lambda x, _: torch.atan(x), torch.arange(1), 1, [StageConfig(1.0, 0, 30, over_relaxation=FACTOR)], 20.0
-    )
-    start = Vector(torch.full((1, 1), 4.0, dtype=torch.float64))
-    result = minimise(problem, start, DAMPED, record=True)
-    assert [bool(iteration.accepted) for iteration in result.trajectory[:2]] == [False, False]
-    assert result.status.tolist() == [0]
-    assert float(result.state.x.abs()) < 0.05
-
-
 def test_a_candidate_that_is_not_finite_is_not_the_end() -> None:
     class Broken(Bent):
         """A problem with a lower cost beyond 1.2, where other values are broken."""
@@ -160,12 +149,6 @@ def test_a_candidate_that_is_not_finite_is_not_the_end() -> None:
     problem = Broken(1.5, [StageConfig(1.0, 0, 30, over_relaxation=FACTOR)])
     result = minimise(problem, zeros(1, 1), DAMPED)
     assert 0.5 < float(result.state.x) < 1.2
-
-
-def test_the_baselines_take_plain_steps() -> None:
-    assert {stage.over_relaxation for stage in load_config("default").stages} == {FACTOR}
-    assert {stage.over_relaxation for stage in load_config("geometric").stages} == {1.0}
-    assert {stage.over_relaxation for stage in load_config("paper").stages} == {1.0}
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])

@@ -16,8 +16,8 @@ from torch import Tensor
 from directshape_torch.config import RefinerConfig
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.state.cars import CarState
-from directshape_torch.terms.photometric import Brightness, is_grazing
-from directshape_torch.terms.photometric_rows import DSO_PATTERN, GRADIENT_CONSTANT, compared, residuals_at
+from directshape_torch.terms.photometric import Brightness
+from directshape_torch.terms.photometric_rows import DSO_PATTERN, compared, residuals_at
 from directshape_torch.terms.robust import huber
 
 
@@ -58,14 +58,6 @@ def test_residuals_at_any_depth_are_the_references_and_have_its_slope(regime: st
     several, comparable_there = residuals_at(rows, torch.stack([depth, 1.2 * depth]))
     torch.testing.assert_close(several[0], residual)
     assert torch.equal(comparable_there[0], comparable)
-
-
-def test_grazing_rays_are_those_below_the_cosine() -> None:
-    # |grad . ray| / (|grad| |ray|) is 0.099 and 0.101.
-    cosine = torch.tensor([0.099, 0.101], dtype=torch.float64)
-    normal = torch.tensor([0.5, 0.0, 0.0], dtype=torch.float64).view(3, 1, 1).expand(3, 1, 2)
-    direction = 3 * torch.stack([cosine, 0 * cosine, (1 - cosine**2).sqrt()])[:, None]
-    assert is_grazing(normal, direction)[0].tolist() == [True, False]
 
 
 @pytest.mark.parametrize("config", CONFIGS)
@@ -124,20 +116,6 @@ def test_a_pixel_that_lands_on_a_nearer_cars_mask_is_not_compared() -> None:
             assert (scene.detections.mask_right.dense()[0, v, u] < 0.5).all()
     assert support[0][0] == support[1][0]
     assert support[0][1] < support[1][1]
-
-
-def test_pixel_sets_and_their_weights() -> None:
-    """Hits on the mask, and for the paper every hit; `c^2 / (c^2 + |grad I_l|^2)` of each."""
-    for config, needs_mask in ((DEFAULT, True), (PAPER, False)):
-        stage, _ = _stage(config)
-        term = photometric_of(stage)
-        counted = term.pixel_set.rows.pixel_weight > 0
-        own = left_of(stage).packed.row.flatten()[term.pixel_set.prepared_place][counted]
-        assert bool((left_of(stage).pixels.foreground[own] > 0.5).all()) is needs_mask
-        assert int(counted.sum()) == int(term.pixel_set.support.sum())
-        c2 = GRADIENT_CONSTANT**2
-        expected = c2 / (c2 + left_of(stage).pixels.gradient_magnitude[own] ** 2)
-        torch.testing.assert_close(term.pixel_set.rows.pixel_weight[counted], expected)
 
 
 @pytest.mark.parametrize("change", ["darker", "flatter"])

@@ -9,12 +9,11 @@ import pytest
 import torch
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import DEFAULT
-from helpers.synthetic_scene import CAMERA_HEIGHT_M, Street, joined_detections, joined_frames, masked, street
+from helpers.synthetic_scene import CAMERA_HEIGHT_M, Street, joined_detections, joined_frames, street
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.geometry import se3
-from directshape_torch.numerics.tables import Chosen
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene.detections import Detections
@@ -159,15 +158,6 @@ def test_a_side_that_has_turned_away_does_not_count() -> None:
     assert counts[1] < 0.3 * counts[0]
 
 
-def test_a_next_view_without_a_left_mask_shows_nothing() -> None:
-    frames, detections = drive()
-    detections = masked(detections, torch.arange(len(detections)) != 2)
-    term, _ = begun(*at_truth(frames, detections))
-    counted = term.row_weight[..., 0].sum(dim=1)
-    assert (counted[term.blocks.owner == 0] == 0).all()
-    assert (counted[term.blocks.owner == 1] > 0).any()
-
-
 def shifted(values: Tensor, row: int, by: int) -> Tensor:
     """Values (N, ..., W) of which one row has lost its first columns, padded at the end."""
     values = values.clone()
@@ -227,23 +217,3 @@ def test_what_images_change_is_differentiable(brightness: Brightness) -> None:
         numeric = (slopes(1e-6) - slopes(-1e-6)) / 2e-6
     assert abs(numeric) > 1e-3
     torch.testing.assert_close(slope, numeric, rtol=1e-3, atol=0)
-
-
-def test_cars_keep_their_rows_when_others_leave() -> None:
-    problem, state = at_truth(*drive())
-    term, prepared = begun(problem, state)
-    keep = torch.tensor([False, True, False, True, True, False])
-    cars = Chosen.where(keep)
-    numbers = list(cars.numbers)
-    fewer = term.of(cars)
-    blocks = keep[term.blocks.owner]
-    there = TrackState(*(x[numbers] for x in state))
-    anchor = type(term.anchor(prepared))(*(x[..., blocks, :] for x in term.anchor(prepared)))
-    field = field_of(problem.prior.bind(state.code))
-    residual = term.linear(field, state, term.anchor(prepared)).residual[blocks]
-    of_fewer = fewer.linear(field_of(problem.prior.bind(there.code)), there, anchor).residual
-    torch.testing.assert_close(of_fewer, residual, rtol=1e-9, atol=1e-9)
-    # Before a stage begins too.
-    whole = problem.evidence[0].of(cars)
-    assert isinstance(whole, NextViewEvidence)
-    assert whole.next_views.detection_row.tolist() == NEXT[numbers].tolist()
