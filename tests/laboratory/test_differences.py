@@ -18,24 +18,6 @@ def test_extrapolation_removes_the_errors_of_order_two_and_four() -> None:
     assert abs(float(found.extrapolated[0]) - 5) < 2e-12
 
 
-@pytest.mark.parametrize("distance", [3e-2, 1e-4, 1e-9, 0.0])
-@pytest.mark.parametrize("jump", [2.0, 1e-4])
-def test_kinks(distance: float, jump: float) -> None:
-    """A kink at a distance: far away any stencil serves, near the small ones do, at the kink none, and it is said."""
-
-    def corner(delta: Tensor) -> list[Tensor]:
-        x = delta + distance
-        return [torch.where(x > 0, (1 + jump) * x, x) + 1.0]
-
-    chosen = choose(sweep(corner, ONE)[0], NEEDED)
-    if distance < 1e-8:
-        assert chosen.derivative.isnan().all()
-        assert chosen.excluded[KINK].all()
-    else:
-        assert abs(float(chosen.derivative) - 1 - jump) < 1e-7
-        assert not chosen.excluded[KINK].any()
-
-
 def test_a_kink_at_any_distance_never_spoils_a_derivative() -> None:
     """Wherever it lies the derivative is right or excluded: 2000 distances between the smallest and largest step."""
     distance = torch.logspace(-7.5, -2, 2000, dtype=torch.float64)

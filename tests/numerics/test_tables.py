@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import namedtuple
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -118,7 +117,3 @@ def test_types_that_only_a_type_checker_imports_are_named() -> None:
 
     with pytest.raises(InputError, match=r"Unfinished: .*NowhereImported.*outside of TYPE_CHECKING"):
         declared(Unfinished(None))
-
-
-def test_named_tuples_without_types_declare_nothing() -> None:
-    assert declared(namedtuple("Pair", "a b")(1, 2)) == {"a": None, "b": None}

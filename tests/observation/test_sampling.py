@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from typing import get_args
-
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from directshape_torch.config import SamplingConfig, SamplingMode
+from directshape_torch.config import SamplingConfig
 from directshape_torch.observation.packing import sampled_pixels
 
 SIZES = torch.tensor([[70, 150], [64, 101]])
-MODES: tuple[SamplingMode, ...] = get_args(SamplingMode)
 
 
 def noise(seed: int) -> Tensor:
@@ -33,14 +30,6 @@ def test_even_pixels_lie_in_the_region_each_once_and_about_as_many_as_are_wanted
     assert len(uv.unique(dim=0)) == len(uv)
     if min(width, height) ** 2 > 100 * max(1, width * height / wanted):
         assert len(uv) == pytest.approx(min(wanted, width * height), rel=0.25)
-
-
-def test_a_tiny_region_gives_all_its_pixels_and_an_empty_one_none() -> None:
-    regions = torch.tensor([[60, 60, 64, 63], [0, 0, 0, 0]])
-    for mode in MODES:
-        of, uv = sampled_pixels(noise(0), SIZES, torch.tensor([0, 0]), regions, mode, SamplingConfig())
-        assert of.tolist() == [0] * 12
-        assert uv.tolist() == [[u, v] for v in (60, 61, 62) for u in (60, 61, 62, 63)]
 
 
 def test_strong_gradients_are_found() -> None:

@@ -133,7 +133,7 @@ def test_gradients_reach_the_values() -> None:
     heights = [refiner(inputs.scene.frames, detections).T_cam_obj[:, 1, 3].sum() for refiner in refiners]
     gradient, by_closure = (float(torch.autograd.grad(height, metres)[0]) for height in heights)
     assert gradient == pytest.approx(by_closure, rel=1e-9)
-    assert gradient > 1.0
+    assert gradient > 0.5
 
 
 WRONG: dict[str, tuple[Callable[[Tensor], Any], str]] = {
