@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,10 @@ from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
 from directshape_torch.refinement.candidates import probability_of_sense
 from directshape_torch.refinement.result import RefinementResult
+from directshape_torch.scene.frames import FrameBatch
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.state.cars import CarBatch
+from directshape_torch.terms.priors import PriorTerm
 
 DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 
@@ -109,6 +114,24 @@ def test_a_batch_equals_a_loop_and_poses_of_one_car_change_no_other(demo: Loaded
     assert found.quality.probability_heading.isnan().tolist() == [False, True, True]
 
 
+def test_terms_are_made_once_and_of_the_boxes_that_were_given(demo: LoadedFrame, cars: Detections) -> None:
+    """The prior of the pose compares with the given box, wherever a candidate begins."""
+    far = cars.T_cam_obj.clone()
+    far[:, 2, 3] += 2.0
+    made: list[CarBatch] = []
+
+    def nothing(_frames: FrameBatch, _detections: Detections, cars: CarBatch, _prior: ShapePrior) -> PriorTerm:
+        made.append(cars)
+        return PriorTerm("nothing", 1.0, cars, lambda _, state: 0.0 * state.code[:, :1], 1, ("code",))
+
+    refiner = DirectShapeRefiner(config=load_config(None, ["check=off"]), extra_terms=[nothing])
+    with torch.no_grad():
+        refiner(demo.frame, with_others(cars, far))
+    (given,) = made
+    assert given.detection_row.tolist() == [0, 1, 2, 0, 1, 2]
+    assert torch.equal(given.detector_T_cam_obj, torch.cat([cars.T_cam_obj, cars.T_cam_obj]))
+
+
 def test_poses_behind_the_camera_and_missing_ones_are_no_candidates(demo: LoadedFrame, cars: Detections) -> None:
     behind = cars.T_cam_obj.clone()
     behind[:, 2, 3] *= -1
@@ -122,6 +145,16 @@ def test_the_box_of_the_chosen_pose_is_compared_and_combined(demo: LoadedFrame, 
     found, alone = refined(demo, with_others(replace(cars, T_cam_obj=far), cars.T_cam_obj)), refined(demo, cars)
     torch.testing.assert_close(found.comparison.difference, alone.comparison.difference, rtol=0, atol=0.1)
     torch.testing.assert_close(found.T_cam_obj, alone.T_cam_obj, rtol=0, atol=0.1)
+
+
+def test_cars_outside_of_tracks_choose_as_in_a_call_without_tracks(demo: LoadedFrame, cars: Detections) -> None:
+    several = with_others(cars, turned(cars.T_cam_obj, 180))
+    by_itself = replace(several, track_id=torch.tensor([-1, -1, -1]))
+    found, expected = refined(demo, by_itself), refined(demo, several)
+    # Both poses of a car are refined in one batch in one call, and one after the other in the other.
+    for name in ("T_cam_obj", "code", "status_code", "covariance", "quality.probability_heading"):
+        (of_found, of_expected) = (attrgetter(name)(result) for result in (found, expected))
+        torch.testing.assert_close(of_found, of_expected, rtol=0.01, atol=1e-4, equal_nan=True)
 
 
 @pytest.mark.parametrize("mode", ["unroll", "implicit"])

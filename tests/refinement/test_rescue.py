@@ -99,17 +99,6 @@ def test_cars_that_are_not_lost_cost_no_disparity(monkeypatch: pytest.MonkeyPatc
         refined(scene.frame, cars(scene, 1, 2), "search=always")
 
 
-def test_masks_of_other_cars_and_other_images_move_no_box() -> None:
-    scene = load_scene()
-    given = scene.detections
-    rolled = (torch.arange(len(given)) + 1) % len(given)
-    swapped = replace(given, mask_left=given.mask_left.rows(rolled), mask_right=given.mask_right.rows(rolled))
-    assert Status.rescued not in refined(scene.frame, swapped).status
-    for shift_px in (150, 420):
-        images = {side: getattr(scene.frame, side).roll(shift_px, dims=3) for side in ("images_left", "images_right")}
-        assert Status.rescued not in refined(replace(scene.frame, **images), given).status
-
-
 def test_views_of_tracks_and_boxes_made_of_masks_are_left_alone() -> None:
     scene = load_scene()
     given = replace(cars(scene, 1), T_cam_obj=turned(cars(scene, 1).T_cam_obj))

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+import torch
 
-from directshape_torch import Detections, DirectShapeRefiner, RefinementResult, load_config
-from directshape_torch.geometry.box_formats import poses_to_boxes
+from directshape_torch import DirectShapeRefiner, RefinementResult, load_config
 from directshape_torch.laboratory.scenes import load_scene, select_detections
 from directshape_torch.status import Status
 
@@ -50,20 +50,17 @@ def test_boxes_and_masks_of_another_image_show_no_car() -> None:
     """The images are moved along themselves, so that streets and walls lie under the masks of six cars."""
     scene = load_scene()
     refiner = DirectShapeRefiner(config=load_config("default")).to(scene.detections.T_cam_obj.dtype)
-    num_refined = 0
     for shift_px in (150, 330, 520):
         images = {side: getattr(scene.frame, side).roll(shift_px, dims=3) for side in ("images_left", "images_right")}
         result: RefinementResult = refiner(replace(scene.frame, **images), scene.detections)
-        num_refined += int(result.refined.sum())
-    assert num_refined <= 5, f"{num_refined} of 18"
+        assert int(result.refined.sum()) <= 1
+        assert Status.rescued not in result.status
 
 
 def test_masks_of_other_cars_are_refused_by_name() -> None:
     scene = load_scene()
-    masks = scene.detections.mask_left.dense().roll(1, dims=0)
-    boxes = poses_to_boxes(scene.detections.T_cam_obj, scene.detections.dimensions_hwl, "kitti")
-    others = Detections.from_boxes(boxes, "kitti", mask_left=masks)
-    refiner = DirectShapeRefiner(config=load_config("default")).to(scene.detections.T_cam_obj.dtype)
-    result: RefinementResult = refiner(scene.frame, others)
-    assert not result.refined.any()
+    given, others = scene.detections, torch.arange(len(scene.detections)).roll(1)
+    swapped = replace(given, mask_left=given.mask_left.rows(others), mask_right=given.mask_right.rows(others))
+    refiner = DirectShapeRefiner(config=load_config("default")).to(given.T_cam_obj.dtype)
+    result: RefinementResult = refiner(scene.frame, swapped)
     assert set(result.status) <= {Status.mask_missed, Status.no_match, Status.no_car, Status.rejected_worse}

@@ -193,6 +193,18 @@ def test_what_begins_a_term_with_a_jacobian_needs_none_itself() -> None:
     torch.testing.assert_close(found.T_cam_obj, expected.T_cam_obj, rtol=0, atol=0)
 
 
+class TensorTerm(LowerTerm):
+    """A `TensorTerm` looks at rows of one tensor, without a tuple around it."""
+
+    def anchor(self, prepared: Prepared) -> Tensor:
+        return torch.ones(len(self.blocks.owner), 1)
+
+
+def test_one_tensor_says_where_rows_look() -> None:
+    nowhere, looking = (refine(lambda *scene, kind=kind: kind.on("user", scene[2])) for kind in (LowerTerm, TensorTerm))
+    torch.testing.assert_close(looking.T_cam_obj, nowhere.T_cam_obj, rtol=0, atol=0)
+
+
 def _poisoned(name: str, when: Callable[[CarState], Tensor]) -> Callable[[CarBatch, CarState], PriorResidual]:
     """A term whose residual or Jacobian of the first detection is NaN where a condition (B,) on the state is true."""
 

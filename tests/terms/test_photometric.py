@@ -11,11 +11,13 @@ from helpers.problems import CONFIGS, DEFAULT, PAPER, begun_stage, figures_at, l
 from helpers.synthetic_scene import cached_street, disturbed, street
 from helpers.term_cases import case
 from reference import residuals as reference
+from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.state.cars import CarState
-from directshape_torch.terms.photometric_rows import DSO_PATTERN, compared, residuals_at
+from directshape_torch.terms.photometric import Brightness
+from directshape_torch.terms.photometric_rows import DSO_PATTERN, GRADIENT_CONSTANT, compared, residuals_at
 from directshape_torch.terms.robust import huber
 
 
@@ -114,3 +116,39 @@ def test_a_pixel_that_lands_on_a_nearer_cars_mask_is_not_compared() -> None:
             assert (scene.detections.mask_right.dense()[0, v, u] < 0.5).all()
     assert support[0][0] == support[1][0]
     assert support[0][1] < support[1][1]
+
+
+def test_pixel_sets_and_their_weights() -> None:
+    """Hits on the mask, and for the paper every hit; `c^2 / (c^2 + |grad I_l|^2)` of each."""
+    for config, needs_mask in ((DEFAULT, True), (PAPER, False)):
+        stage, _ = _stage(config)
+        term = photometric_of(stage)
+        counted = term.pixel_set.rows.pixel_weight > 0
+        own = left_of(stage).packed.row.flatten()[term.pixel_set.prepared_place][counted]
+        assert bool((left_of(stage).pixels.foreground[own] > 0.5).all()) is needs_mask
+        assert int(counted.sum()) == int(term.pixel_set.support.sum())
+        c2 = GRADIENT_CONSTANT**2
+        expected = c2 / (c2 + left_of(stage).pixels.gradient_magnitude[own] ** 2)
+        torch.testing.assert_close(term.pixel_set.rows.pixel_weight[counted], expected)
+
+
+@pytest.mark.parametrize("change", ["darker", "flatter"])
+def test_a_matched_brightness_takes_a_change_of_the_right_image_off_the_gradient(change: str) -> None:
+    """20 grey levels darker, or 0.9 of the contrast about 100: the paper's residuals see both."""
+    prior, scene = cached_street()
+    grey = 255 * scene.frames.images_right
+    changed = grey - 20 if change == "darker" else 0.9 * grey + 10
+    assert 0 <= float(changed.min()) <= float(changed.max()) <= 255
+    frames = replace(scene.frames, images_right=changed / 255)
+
+    def off_by(brightness: Brightness) -> float:
+        settings = replace(DEFAULT, photometric=replace(DEFAULT.photometric, brightness=brightness))
+        g: list[Tensor] = []
+        for each in (scene.frames, frames):
+            stage, state = begun_stage(prior, each, disturbed(scene.detections, 0.05, 0.02), settings)
+            g.append(figures_at(stage, state).gradient[:, 2])
+        return float((g[1] - g[0]).norm() / g[0].norm())
+
+    assert off_by("none") > 0.1
+    # Residuals after the match are those of the right image, so its contrast is a factor of them, squared in g.
+    assert off_by("affine") < (1e-6 if change == "darker" else 0.2)

@@ -112,6 +112,24 @@ def test_products_are_the_same_with_gradients_on() -> None:
 
 # Where the contour of the rendered silhouette lies
 
+
+def test_zeta_comes_from_the_input_depth_and_not_from_the_state() -> None:
+    prior, scene = cached_street()
+    detections = disturbed(scene.detections)
+    stage, state = begun_stage(prior, scene.frames, detections)
+    term = stage.terms[0]
+    assert isinstance(term, Silhouettes)
+    expected = (150.0 / (detections.T_cam_obj[:, 2, 3] * 0.5)).clamp(4.0, 400.0)
+    torch.testing.assert_close(term.zeta[:, 0], expected[term.blocks.owner])
+    nearer = CarState.of(se3.exp(vector(0, 0, 2.0, 0, 0, 0)) @ state.T_obj_cam, state.code)
+    problem = stage.problem
+    again, softer = (problem.begin(x, problem.prepare(nearer)).terms[0] for x in (1, 0))
+    assert isinstance(again, Silhouettes)
+    assert isinstance(softer, Silhouettes)
+    assert torch.equal(again.zeta, term.zeta)
+    torch.testing.assert_close(softer.zeta, term.zeta / 4)
+
+
 FOCAL_PX = 720.0
 CAR = Ellipsoid(vector(2.0, 0.75, 0.85), vector(0.0, -0.75, 0.0), 0.75)
 EYE = vector(0.4, -0.9, 0.0)

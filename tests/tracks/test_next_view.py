@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import pytest
 import torch
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import DEFAULT
@@ -18,7 +19,7 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.shape.field import field_of
-from directshape_torch.terms.photometric import PhotometricEvidence
+from directshape_torch.terms.photometric import Brightness, PhotometricEvidence
 from directshape_torch.terms.term import Prepared
 from directshape_torch.tracks.next_view import NextView, NextViewEvidence, NextViews
 from directshape_torch.tracks.state import TrackState
@@ -65,6 +66,13 @@ def begun(problem: CarProblem, state: TrackState, stage: int = 1) -> tuple[NextV
     (term,) = problem.begin(stage, prepared).terms
     assert isinstance(term, NextView)
     return term, prepared
+
+
+def disturbed(state: TrackState) -> TrackState:
+    """The state moved by centimetres; the copied poses of the next views are moved by other amounts."""
+    generator = torch.Generator().manual_seed(3)
+    delta = torch.randn(6, state.unknowns.size, generator=generator, dtype=torch.float64)
+    return state.unknowns.retract(state, 0.01 * delta)
 
 
 def test_true_poses_and_shapes_explain_the_next_view() -> None:
@@ -171,3 +179,26 @@ def test_the_exposure_of_the_next_frame_does_not_matter() -> None:
     greys = [begun(*at_truth(f, detections))[0] for f in (frames, replace(frames, images_left=darker))]
     ratio = (greys[1].image.grey / greys[0].image.grey)[greys[0].blocks.owner == 0]
     torch.testing.assert_close(ratio, torch.full_like(ratio, 0.9), rtol=0.01, atol=0)
+
+
+@pytest.mark.parametrize("brightness", ["none", "gain"])
+def test_what_images_change_is_differentiable(brightness: Brightness) -> None:
+    frames, detections = drive()
+    config = replace(DEFAULT, photometric=replace(DEFAULT.photometric, brightness=brightness))
+    noise = torch.randn(frames.images_left.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+
+    def slopes(by: Tensor | float) -> Tensor:
+        changed = replace(frames, images_left=frames.images_left + 0.02 * by * noise)
+        problem, state = at_truth(changed, detections, config=config)
+        with torch.no_grad():
+            prepared = problem.prepare(state)
+        # The state at which a stage begins is a constant.
+        stage = problem.begin(1, prepared)
+        return stage.linearise_differentiably(disturbed(state)).gradient.square().sum()
+
+    by = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(slopes(by), by)
+    with torch.no_grad():
+        numeric = (slopes(1e-6) - slopes(-1e-6)) / 2e-6
+    assert abs(numeric) > 1e-3
+    torch.testing.assert_close(slope, numeric, rtol=1e-3, atol=0)
