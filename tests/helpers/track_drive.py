@@ -82,15 +82,13 @@ def assert_same(one: RefinementResult, other: RefinementResult) -> None:
         assert torch.equal(torch.nan_to_num(values), torch.nan_to_num(second[name])), name
 
 
-def doubt(monkeypatch: pytest.MonkeyPatch, *in_track: int, alone: int | None = None, num_rows: int = 6) -> list[int]:
-    """Make views untrusted in calls or tracks of so many rows; return the sizes of all calls."""
-    sizes: list[int] = []
+def doubt(monkeypatch: pytest.MonkeyPatch, *in_track: int, alone: int | None = None, num_rows: int = 6) -> None:
+    """Make views untrusted in calls or tracks of so many rows."""
 
     def judged(
         minimum: CarMinimum[AnyState], initial: AnyState, *args: Any
     ) -> tuple[CarMinimum[AnyState], RefinementResult]:
         minimum, found = make_result.judged(minimum, initial, *args)
-        sizes.append(len(minimum.status))
         rows = in_track if isinstance(minimum.stage.problem.sharing, Groups) else (alone,)
         if len(minimum.status) != num_rows:
             return minimum, found
@@ -100,4 +98,3 @@ def doubt(monkeypatch: pytest.MonkeyPatch, *in_track: int, alone: int | None = N
         return replace(minimum, state=state, status=status), replace(found, status_code=status)
 
     monkeypatch.setattr(refinements, "judged", judged)
-    return sizes
