@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import runpy
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ import yaml
 import directshape_torch
 from directshape_torch.config import (
     BackwardConfig,
-    PriorConfig,
     RefinerConfig,
     SamplingConfig,
     Settings,
@@ -103,21 +101,11 @@ def test_a_value_out_of_range_is_named(override: str, text: str) -> None:
     assert text in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("make", "text"),
-    [
-        (lambda: RefinerConfig(compile=True), "compile: expected one of on, off, got True"),  # type: ignore[arg-type]
-        (lambda: SamplingConfig(density="5 %"), "density: expected a finite number, above 0 and at most 1, got '5 %'"),  # type: ignore[arg-type]
-        (
-            lambda: dataclasses.replace(PriorConfig(), dimensions_sigma_m=(0.1, 0.0, 0.4)),
-            "dimensions_sigma_m: expected a finite number, above 0, got (0.1, 0.0, 0.4)",
-        ),
-    ],
-)
-def test_groups_made_in_python_are_checked_too(make: Callable[[], object], text: str) -> None:
-    with pytest.raises(ConfigError) as error:
-        make()
-    assert str(error.value) == text
+def test_groups_made_in_python_are_checked_too() -> None:
+    with pytest.raises(ConfigError, match=r"^compile: expected one of on, off, got True$"):
+        RefinerConfig(compile=True)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=r"^density: expected a finite number, above 0 and at most 1, got '5 %'$"):
+        SamplingConfig(density="5 %")  # type: ignore[arg-type]
 
 
 def test_every_setting_is_described_and_every_number_has_limits() -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cache
 
 import pytest
+import torch
 
 from directshape_torch.laboratory.bench import Bench
 from directshape_torch.laboratory.regimes import REGIMES
@@ -24,6 +26,12 @@ SHORT = ("typical", "near_3m", "far_80m", "grazing", "contour", "grid_border", "
 def bench(request: pytest.FixtureRequest) -> Bench:
     """Three states of each regime in turn, float64."""
     return _bench_of(request.param)
+
+
+@pytest.fixture
+def no_gradients() -> Iterator[None]:
+    with torch.no_grad():
+        yield
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 
 import pytest
 import torch
@@ -17,13 +16,9 @@ from directshape_torch.rows import Rays
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.terms.depth import Closest, Hits, marched_views
 
+pytestmark = pytest.mark.usefixtures("no_gradients")
+
 Call = tuple[Rays, Rays, Tensor, int, GridShape, Tensor]
-
-
-@pytest.fixture(autouse=True)
-def _no_gradients() -> Iterator[None]:
-    with torch.no_grad():
-        yield
 
 
 def call_of(bench: Bench, num_samples: int = 24) -> Call:

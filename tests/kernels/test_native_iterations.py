@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -19,6 +18,8 @@ from directshape_torch.refinement.problem import CarIterations, CarStage
 from directshape_torch.solver.iteration import begin, iterate
 from directshape_torch.solver.problem import RUNNING, Progress
 from directshape_torch.status import Status
+
+pytestmark = pytest.mark.usefixtures("no_gradients")
 
 MOST_DAMPING = 1e5
 
@@ -51,12 +52,6 @@ class Begun(NamedTuple):
                 running, _, _ = iterate(self.iterations, progress, self.config, self.limits, self.stage.over_relaxation)
             costs.append((running, progress.at_state.cost))
         return progress, costs
-
-
-@pytest.fixture(autouse=True)
-def _no_gradients() -> Iterator[None]:
-    with torch.no_grad():
-        yield
 
 
 def begun(*changes: str, number: int = 0, **settings: Any) -> Begun:

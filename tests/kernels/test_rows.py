@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import pytest
@@ -15,6 +14,8 @@ from directshape_torch.numerics.tables import Chosen
 from directshape_torch.shape.field import Field, field_of
 from directshape_torch.state.unknowns import State
 from directshape_torch.terms.term import AnyTerm, Part, in_all_columns, part_of, parts_of
+
+pytestmark = pytest.mark.usefixtures("no_gradients")
 
 NAMES = ("silhouettes", "photometric")
 
@@ -35,12 +36,6 @@ class Rows(NamedTuple):
     def by_tensors(self, fisher: bool = True) -> Part[Any]:
         at = self.term.linear(self.field, self.state, self.anchor)
         return part_of(self.term, in_all_columns(self.term, self.state, at), fisher)
-
-
-@pytest.fixture(autouse=True)
-def _no_gradients() -> Iterator[None]:
-    with torch.no_grad():
-        yield
 
 
 def rows_of(bench: Bench, name: str) -> Rows:

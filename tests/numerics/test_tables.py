@@ -11,7 +11,7 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.records import Dense, declared
-from directshape_torch.numerics.tables import Chosen, Table
+from directshape_torch.numerics.tables import Chosen, Table, joined
 from directshape_torch.rows import Blocks
 
 CARS = Chosen(torch.tensor([False, True, False, True]), [1, 3])
@@ -53,6 +53,20 @@ def test_rows_of_cars_and_of_their_blocks_remain_and_owners_get_new_numbers() ->
         assert torch.equal(part.points, before.points[:, kept])
     assert few.bounds is whole.bounds
     assert few.blocks.kept(Chosen(torch.tensor([True, False]), [0])).tolist() == [1]
+
+
+def test_tables_are_joined_car_after_car() -> None:
+    whole = table()
+    parts = [whole.of(CARS), whole.of(Chosen.where(torch.tensor([True, True, False, False])))]
+    both = joined(parts, [2, 2])
+    assert both.blocks.owner.tolist() == [1, 0, 1, 3, 2]
+    assert both.blocks.counts == (1, 2, 1, 1)
+    assert both.counts == (6, 8, 5, 6)
+    assert both.offset is None
+    for part, before in zip((both.inner, *both.several), (whole.inner, *whole.several), strict=True):
+        assert torch.equal(part.points, before.points[:, [0, 1, 3, 1, 2]])
+    assert both.bounds is whole.bounds
+    assert joined([whole], [4]).blocks.owner.tolist() == BLOCKS.owner.tolist()
 
 
 def test_types_that_only_a_type_checker_imports_are_named() -> None:

@@ -17,6 +17,7 @@ from directshape_torch.geometry.box3d import rotation_y_from_pose
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import open_dataset
+from directshape_torch.start.from_masks import _another
 
 
 def axis_error_deg(detections: Detections, truth: Detections) -> Tensor:
@@ -49,6 +50,20 @@ def test_the_opposite_heading_comes_along_and_every_start_stands_on_the_road() -
     # A start without another rectangle has one other pose, and a mask without a start has none.
     known = others.isfinite().flatten(2).all(dim=2).sum(dim=1)
     assert set(known.tolist()) <= {1, 3}
+
+
+def test_another_rectangle_is_the_next_best_that_differs() -> None:
+    best = torch.tensor([1.0, 20.0, 0.3, 3.9, 1.6])
+    same, turned, moved = best + 0.1, best.clone(), best.clone()
+    turned[2] += 1.4
+    moved[1] += 1.0
+    half_turn = best.clone()
+    half_turn[2] += math.pi
+    found = _another(
+        torch.stack([torch.stack(x) for x in ([best, same, turned, moved], [best, half_turn, same, same])])
+    )
+    assert torch.equal(found[0], turned)
+    assert found[1].isnan().all()
 
 
 def test_the_result_does_not_depend_on_the_other_masks() -> None:
