@@ -12,7 +12,7 @@ from torch import Tensor
 
 from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, RefinementResult, load_config
 from directshape_torch.geometry.box3d import rotation_about_y, rotation_y_from_pose
-from directshape_torch.laboratory.scenes import LaboratoryScene, load_scene, select_detections
+from directshape_torch.laboratory.scenes import LaboratoryScene, load_scene
 from directshape_torch.refinement import lost_cars
 from directshape_torch.status import Status
 
@@ -26,9 +26,8 @@ def refined(frame: FrameBatch, detections: Detections, *settings: str) -> Refine
 
 
 @cache
-def as_given(search: str) -> RefinementResult:
-    scene = load_scene()
-    return refined(scene.frame, scene.detections, f"search={search}")
+def as_given() -> RefinementResult:
+    return refined(load_scene().frame, load_scene().detections, "search=off")
 
 
 def turned(T_cam_obj: Tensor) -> Tensor:
@@ -51,7 +50,7 @@ def cars(scene: LaboratoryScene, *rows: int) -> Detections:
 
 def distance_from_given(found: RefinementResult, row: int) -> tuple[float, float]:
     """Metres and degrees, modulo half a turn, from the car that the boxes as they are lead to."""
-    truth = as_given("off")
+    truth = as_given()
     metres = (found.T_cam_obj[row, :3, 3] - truth.T_cam_obj[row, :3, 3]).norm()
     angle = rotation_y_from_pose(found.T_cam_obj[row]) - rotation_y_from_pose(truth.T_cam_obj[row])
     return float(metres), math.degrees(float(torch.asin(torch.sin(angle).abs())))
@@ -134,23 +133,24 @@ def test_gradients_hold_for_the_start_that_was_chosen() -> None:
     assert given.T_cam_obj.grad is None or not given.T_cam_obj.grad.any()
 
 
+EVERY = "acceptance.min_probability_better=0", "acceptance.min_probability_not_worse=0"
+
+
 def refined_from(factor: float, dimensions: float, *settings: str) -> RefinementResult:
+    """The result of three cars whose places and sizes are wrong by factors, without a search for them."""
     scene = load_scene()
-    first = select_detections(scene.detections, scene.detections.frame_index.new_tensor([0, 1, 3]))
-    T_cam_obj = first.T_cam_obj.clone()
+    T_cam_obj = cars(scene, 0, 1, 3).T_cam_obj.clone()
     T_cam_obj[:, :3, 3] *= factor
-    moved = replace(first, T_cam_obj=T_cam_obj, dimensions_hwl=first.dimensions_hwl * dimensions)
-    # The default finds these cars from their masks.
-    config = load_config("default", ["search=off", *settings])
-    result: RefinementResult = DirectShapeRefiner(config=config).to(T_cam_obj.dtype)(scene.frame, moved)
+    moved = replace(cars(scene, 0, 1, 3), T_cam_obj=T_cam_obj)
+    moved = replace(moved, dimensions_hwl=moved.dimensions_hwl * dimensions)
+    result = refined(scene.frame, moved, "search=off", *settings)
     assert result.sigma_xyz_yaw[result.refined].isfinite().all()
     return result
 
 
 @pytest.mark.parametrize("dimensions", [1.0, 200.0])
 def test_boxes_beyond_two_kilometres_have_no_evidence_whatever_is_accepted(dimensions: float) -> None:
-    every = "acceptance.min_probability_better=0", "acceptance.min_probability_not_worse=0"
-    result = refined_from(200.0, dimensions, *every)
+    result = refined_from(200.0, dimensions, *EVERY)
     assert (result.T_cam_obj[:, 2, 3] > 2000).all()
     assert set(result.status) <= {Status.mask_missed, Status.no_match, Status.depth_unknown}
     assert result.quality.probability_not_worse.isnan().all()
@@ -158,31 +158,27 @@ def test_boxes_beyond_two_kilometres_have_no_evidence_whatever_is_accepted(dimen
 
 @pytest.mark.parametrize(("factor", "dimensions"), [(2.0, 1.0), (2.0, 2.0), (0.5, 1.0), (0.5, 0.5)])
 def test_a_wrong_depth_has_no_evidence(factor: float, dimensions: float) -> None:
-    """Of twice the size at twice the depth, so that they cover their masks, too."""
+    """Cars of twice the size at twice the depth cover their masks, too."""
     wrong = refined_from(factor, dimensions)
     assert not wrong.refined.any(), wrong.status
 
 
 def test_boxes_as_they_are_come_back_refined() -> None:
-    every = "acceptance.min_probability_better=0", "acceptance.min_probability_not_worse=0"
-    assert refined_from(1.0, 1.0, *every).refined.all()
+    assert refined_from(1.0, 1.0, *EVERY).refined.all()
 
 
 def test_boxes_and_masks_of_another_image_show_no_car() -> None:
     """The images are moved along themselves, so that streets and walls lie under the masks of six cars."""
     scene = load_scene()
-    refiner = DirectShapeRefiner(config=load_config("default")).to(scene.detections.T_cam_obj.dtype)
     for shift_px in (150, 330, 520):
         images = {side: getattr(scene.frame, side).roll(shift_px, dims=3) for side in ("images_left", "images_right")}
-        result: RefinementResult = refiner(replace(scene.frame, **images), scene.detections)
+        result = refined(replace(scene.frame, **images), scene.detections)
         assert int(result.refined.sum()) <= 1
         assert Status.rescued not in result.status
 
 
 def test_masks_of_other_cars_are_refused_by_name() -> None:
-    scene = load_scene()
-    given, others = scene.detections, torch.arange(len(scene.detections)).roll(1)
+    given, others = load_scene().detections, torch.arange(6).roll(1)
     swapped = replace(given, mask_left=given.mask_left.rows(others), mask_right=given.mask_right.rows(others))
-    refiner = DirectShapeRefiner(config=load_config("default")).to(given.T_cam_obj.dtype)
-    result: RefinementResult = refiner(scene.frame, swapped)
+    result = refined(load_scene().frame, swapped)
     assert set(result.status) <= {Status.mask_missed, Status.no_match, Status.no_car, Status.rejected_worse}
