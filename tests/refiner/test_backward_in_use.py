@@ -1,4 +1,4 @@
-"""These tests check gradients in use: modes, warnings, weights of terms, memory, autocast, compiled models."""
+"""These tests check gradients in use: modes, warnings, weights of terms, memory, compiled models."""
 
 from __future__ import annotations
 

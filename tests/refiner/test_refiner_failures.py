@@ -294,9 +294,11 @@ def test_nearer_cars_hide_right_pixels_even_of_cars_without_a_right_mask_and_whe
     """What hides a car in the right image is known from all detections, wherever the warp may land."""
     frames, detections = base()
     everything = torch.ones_like(detections.mask_right.dense()[:1])
+    at_camera = detections.T_cam_obj[:1].clone()
+    at_camera[:, 2, 3] = 0.9
     wall = replace(
         select(detections, torch.tensor([0])),
-        T_cam_obj=_at_depth(detections.T_cam_obj[:1], 0.9),
+        T_cam_obj=at_camera,
         mask_left=torch.zeros_like(everything),
         mask_right=everything,
     )
@@ -306,9 +308,3 @@ def test_nearer_cars_hide_right_pixels_even_of_cars_without_a_right_mask_and_whe
     assert result.status[1] is Status.behind_camera
     # Every right pixel is behind the wall, so nothing can be compared photometrically.
     assert not (result.quality.matched_share[0] > 0)
-
-
-def _at_depth(T_cam_obj: Tensor, depth_m: float) -> Tensor:
-    moved = T_cam_obj.clone()
-    moved[:, 2, 3] = depth_m
-    return moved

@@ -160,16 +160,6 @@ def test_wrong_values_are_named(case: str) -> None:
         refine(radar(change), detections=boxes())
 
 
-def test_values_by_names_that_the_residual_does_not_know_are_named() -> None:
-    with pytest.raises(InputError, match=r"^extra term 'radar'.*unexpected keyword argument 'rader_cam'"):
-        refine(radar(name="rader_cam"), detections=boxes())
-
-
-def test_a_weight_for_each_car_is_named() -> None:
-    with pytest.raises(InputError, match=r"^extra term 'radar': weight: expected a number, .*term_weights="):
-        refine(radar(weight=torch.ones(6)), detections=boxes())
-
-
 CLOSED: dict[str, Callable[..., Tensor]] = {
     "all rows": lambda table, _: table,
     "the first rows": lambda table, cars: table[: len(cars)],
@@ -235,12 +225,15 @@ def test_a_declared_table_goes_with_its_cars() -> None:
     torch.testing.assert_close(kept.T_cam_obj, together().T_cam_obj, rtol=0, atol=1e-12)
 
 
-def test_a_table_without_declaration_is_named() -> None:
-    message = r"^extra term 'radar': table: expected a declaration of its axes, got none; .*Dense\(\"B\""
-    with pytest.raises(InputError, match=message):
-        refine(keeping(Undeclared), detections=boxes())
-
-
-def test_a_table_of_other_rows_than_declared_is_named() -> None:
-    with pytest.raises(InputError, match=r"^extra term 'radar': table: expected shape \(6, 3\), got \(5, 3\)"):
-        refine(keeping(Keeping, lambda x: x[1:]), detections=boxes())
+@pytest.mark.parametrize(
+    ("factory", "message"),
+    [
+        (radar(name="rader_cam"), ".*unexpected keyword argument 'rader_cam'"),
+        (radar(weight=torch.ones(6)), ": weight: expected a number, .*term_weights="),
+        (keeping(Undeclared), r": table: expected a declaration of its axes, got none; .*Dense\(\"B\""),
+        (keeping(Keeping, lambda x: x[1:]), r": table: expected shape \(6, 3\), got \(5, 3\)"),
+    ],
+)
+def test_other_mistakes_are_named(factory: TermFactory, message: str) -> None:
+    with pytest.raises(InputError, match="^extra term 'radar'" + message):
+        refine(factory, detections=boxes())
