@@ -79,9 +79,6 @@ def test_log_one_minus_exp_keeps_its_digits() -> None:
     assert log_one_minus_exp(torch.zeros(1)).isfinite().all()
 
 
-# In an energy
-
-
 @pytest.mark.parametrize("form", ["closest_approach", "product"])
 def test_a_ray_that_misses_the_bounds_counts_as_background(
     form: Literal["closest_approach", "product"], monkeypatch: pytest.MonkeyPatch
