@@ -147,11 +147,7 @@ def test_in_a_result_each_car_has_its_own_curve_and_cars_that_were_not_refined_h
     assert profile_at(stage, state, state).cost_after.isnan().all()
 
 
-def test_no_cars_and_other_offsets() -> None:
-    prior, scene = cached_street()
-    none = DirectShapeRefiner(prior, DEFAULT)(scene.frames, select(scene.detections, torch.zeros(0, dtype=torch.long)))
-    assert none.profile.cost_after.shape == (0, 25)
-    assert none.profile.after.offset_px.shape == (0,)
+def test_other_offsets() -> None:
     stage, state = begun(far_street().frames, far_street())
     fine = profile_at(stage, state, state, offsets_px=profile_offsets(1.0, 0.1))
     assert fine.cost_after.shape == (2, 21)

@@ -274,6 +274,7 @@ def test_no_cars(frames_too: bool) -> None:
     assert result.status == []
     assert result.boxes().dimensions_hwl.shape == (0, 3)
     assert result.covariance.shape == (0, 9, 9)
+    assert result.profile.after.offset_px.shape == (0,)
 
 
 def test_a_car_that_is_not_refined_keeps_the_detectors_box_and_has_no_figures() -> None:
