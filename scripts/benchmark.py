@@ -1,7 +1,6 @@
 """This script measures times and numbers of operations of refinements (docs/performance.md).
 
     python scripts/benchmark.py                                  # times, operations, memory of whole calls
-    python scripts/benchmark.py --profile                        # one refinement, by part
     python scripts/benchmark.py --native                         # with native loops over without them
     python scripts/benchmark.py --set compile=on                 # with other settings over the defaults
     python scripts/benchmark.py --peers                          # PyPose's and Theseus's solvers over this library's
@@ -13,22 +12,28 @@ Frames come from DIRECTSHAPE_DATA (or --data), else from the bundled demo frame.
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
-from benchmark_suites.times import time_rows
-from benchmark_suites.timing import Row
-from benchmark_suites.workloads import load_scenes
+from benchmark_suites.measures import Row, Spread, count_operations, peak_tensor_bytes, time_interleaved
+from benchmark_suites.workloads import Scene, load_scenes
 from command_line import run_command
 
 from directshape_torch.batch.refine_dataset import package_version
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.tables import align
+from directshape_torch.io.config_files import load_config
+from directshape_torch.io.frame_collation import collate
+from directshape_torch.refiner import DirectShapeRefiner
 
 _ROUNDS = 3  # of each call; the median over the calls needs few
+_BATCH_FRAMES = 8  # of a call that refines a data set without waiting for single frames
+_PRESETS = ("default", "fast")
 
 
 def run(args: argparse.Namespace) -> None:
@@ -46,10 +51,6 @@ def run(args: argparse.Namespace) -> None:
     root = Path(data) if data else None
     print(machine(torch.device("cpu")), flush=True)
     rounds = 1 if args.quick else _ROUNDS
-    if args.profile:
-        from benchmark_suites.stage_profile import profile_rows
-
-        show(profile_rows(rounds))
     if args.against is not None:
         from benchmark_suites.checkouts import against_rows
 
@@ -66,9 +67,28 @@ def run(args: argparse.Namespace) -> None:
         from benchmark_suites.peers import peer_rows
 
         show(list(peer_rows(root, args.quick)))
-    if not (args.profile or args.native or args.set or args.peers or args.against):
+    if not (args.native or args.set or args.peers or args.against):
         scenes = load_scenes(root, 1 if args.quick else None)
         show([row for scene in scenes for row in time_rows(scene, rounds, args.quick)])
+
+
+def time_rows(scene: Scene, rounds: int, quick: bool = False) -> Iterator[Row]:
+    """Milliseconds, operations and memory of both presets, of single frames and of 8 in a call."""
+    presets = _PRESETS[:1] if quick else _PRESETS
+    refiners = {preset: DirectShapeRefiner(config=load_config(preset)) for preset in presets}
+    for size in (1,) if quick else (1, _BATCH_FRAMES):
+        # The last call is filled with the first frames again, so that every call has its full size.
+        endless, count = itertools.cycle(scene.frames), -(-len(scene.frames) // size)
+        calls = [collate(list(itertools.islice(endless, size))) for _ in range(count)]
+        sides = [{name: partial(refiner, *call) for name, refiner in refiners.items()} for call in calls]
+        times = [time_interleaved(each, rounds) for each in sides]
+        for name, first in sides[0].items():
+            what = f"{scene.name}, {size} frame{'s' if size > 1 else ''} in a call, {name}"
+            per_car = [1e3 * t[name] / len(call[1]) for t, call in zip(times, calls, strict=True)]
+            memory = f"{peak_tensor_bytes(first) / 2**20 / len(calls[0][1]):.1f} MB a car"
+            note = f"{count_operations(first)} operations, {memory}, of the first call"
+            yield Row(f"{what}: ms a call", Spread.of([1e3 * t[name] for t in times]), note)
+            yield Row(f"{what}: ms a car", Spread.of(per_car))
 
 
 def show(rows: Sequence[Row]) -> None:
@@ -96,7 +116,6 @@ def machine(device: torch.device) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line and run; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--profile", action="store_true", help="time and operations of one refinement by part")
     parser.add_argument("--native", action="store_true", help="with native loops over without them, in turn")
     parser.add_argument("--set", nargs="+", metavar="KEY=VALUE", help="with these settings over the defaults, in turn")
     parser.add_argument(

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from command_line import run_command
+from command_line import markdown_table, run_command
 from numpy.typing import NDArray
 
 from directshape_torch.errors import InputError
@@ -105,7 +105,7 @@ def reliability(runs: Sequence[Cars], scales: Sequence[float], title: str) -> st
     """Table of the right share and of predicted and true shares in bins of the prediction, a row for each run."""
     heads = [f"{low:g} to {high:g}" for low, high in pairwise(BINS)]
     head = title, "cars", "right", f"below {_NEAR_M:g} m", "log loss", *heads
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines = []
     for run, scale in zip(runs, scales, strict=True):
         predicted, near = probability(run.difference, scale), run.distance_m < _NEAR_M
         loss = _log_loss(predicted, run.is_right).mean()
@@ -115,8 +115,8 @@ def reliability(runs: Sequence[Cars], scales: Sequence[float], title: str) -> st
             within = (predicted >= low) & ((predicted < high) | (high == 1))
             shares = f"{predicted[within].mean():.2f}, {run.is_right[within].mean():.2f}" if within.any() else ""
             cells.append(f"{shares} ({within.sum()})")
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        lines.append(cells)
+    return markdown_table(head, lines)
 
 
 def run(args: argparse.Namespace) -> None:

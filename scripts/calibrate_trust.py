@@ -8,7 +8,6 @@ A run learns the errors of its detector from its own results, never from labels.
 and, together with boxes and masks on unrelated images, when a car is there; all draws have the same weight. If all runs
 have other roots (by the names of their folders) with other detectors, each run is judged by a model that was fitted to
 these. Cars that the package refuses for lack of evidence are excluded.
-Boxes with the mask of their neighbour in the image are judged, too, but nothing is fitted to them.
 
 The draws, `report.md` and `trust_model.json`, fitted to all runs, are written to OUT.
 """
@@ -29,7 +28,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
-from command_line import run_command
+from command_line import markdown_table, run_command
 from numpy.typing import NDArray
 from trust_calibration.cars import Array, Cars, Judged, outcomes, probabilities, refined_cars, returned
 from trust_calibration.draws import SIMULATED, write_draws
@@ -66,8 +65,8 @@ def runs_of(args: argparse.Namespace) -> list[Cars]:
 
 def _refined(run: tuple[Path, Path, Path, str, bool], overrides: Sequence[str], by_frame: bool) -> bytes:
     """Pickled cars of a run; as single tensors each would need an open file to cross processes."""
-    root, detections, masks, name, with_wrong = run
-    found = refined_cars(root, detections, masks, name, overrides, with_wrong and not by_frame, by_frame)
+    root, detections, masks, name, is_first = run
+    found = refined_cars(root, detections, masks, name, overrides, is_first and not by_frame, by_frame)
     count = sum(len(frame.result) for frame in found.frames)
     print(f"{root.name} {detections.name}: {count} cars", file=sys.stderr, flush=True)
     return pickle.dumps(found)
@@ -124,7 +123,6 @@ class JudgedRow(NamedTuple):
 
     cars: list[Judged]
     elsewhere: list[Judged]
-    swapped: list[Judged]
     model: TrustModel
 
     def returned(self, cars: list[Judged], limits: AcceptanceConfig) -> list[NDArray[np.bool_]]:
@@ -144,60 +142,49 @@ Rows: TypeAlias = Mapping[tuple[str, str], JudgedRow]
 def _judged(runs: Sequence[Cars], row: tuple[str, str], model: TrustModel) -> JudgedRow:
     some, noise = [run for run in runs if (run.root, run.detector) == row], model.image_noise
     elsewhere = [run.judged(noise, run.elsewhere) for run in some if run.elsewhere]
-    swapped = [run.judged(noise, run.swapped) for run in some if run.swapped]
-    return JudgedRow([run.judged(noise, run.frames) for run in some], elsewhere, swapped, model)
+    return JudgedRow([run.judged(noise, run.frames) for run in some], elsewhere, model)
 
 
 def _policies(rows: Rows, limits: AcceptanceConfig) -> str:
     """Table of returned boxes, a row for each detector and root: means over draws with standard deviations."""
     head = "cars", "runs, cars", "input", "images alone (worse)", "most probable (worse)", "returned (worse, share)"
-    wrong = "returned on other images", "returned worse with a neighbour's mask"
-    lines = ["| " + " | ".join((*head, *wrong)) + " |", "|" + "---|" * 8]
+    lines = []
     for (root, detector), row in rows.items():
         cars, share = row.cars, np.mean([kept.mean() for kept in row.returned(row.cars, limits)])
         inputs = _spread([float(each.before.mean()) for each in cars])
         cells = [_cell(cars, [each.images for each in cars]), _cell(cars, [each.after for each in cars])]
         cells.append(f"{_cell(cars, row.chosen(row.cars, limits))[:-1]}, {share:.0%})")
         there = row.returned(row.elsewhere, limits)
-        pairs = zip(row.chosen(row.swapped, limits), row.swapped, strict=True)
-        cells += [_count(there), _count([after < each.before - WORSE_BY for after, each in pairs])]
+        cells.append(f"{sum(each.sum() for each in there)} of {sum(map(len, there))}" if there else "")
         counts = f"{len(cars)}, {np.mean([len(each.before) for each in cars]):.0f}"
-        lines.append(f"| {root} {detector} | {counts} | {inputs} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        lines.append([f"{root} {detector}", counts, inputs, *cells])
+    return markdown_table((*head, "returned on other images"), lines)
 
 
 def _by_one_root(runs: Sequence[Cars], rows: Rows, limits: AcceptanceConfig) -> str:
     """Table of returned boxes where a row is judged by the other detectors of one other root alone."""
     roots = list(dict.fromkeys(root for root, _ in rows))
-    lines = ["| returned, judged by one root | " + " | ".join(roots) + " |", "|---" * (1 + len(roots)) + "|"]
+    lines = []
     for row in rows:
         cells = []
         for root in roots:
             some = [run for run in others_of(runs, row) if run.root == root]
             cells.append(_returned(_judged(runs, row, fitted(some)), limits) if some else "")
-        lines.append(f"| {' '.join(row)} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        lines.append([" ".join(row), *cells])
+    return markdown_table(("returned, judged by one root", *roots), lines)
 
 
 def _returned(row: JudgedRow, limits: AcceptanceConfig) -> str:
     return _cell(row.cars, row.chosen(row.cars, limits), with_spread=False)
 
 
-def _count(flags: Sequence[NDArray[np.bool_]]) -> str:
-    return f"{sum(each.sum() for each in flags)} of {sum(map(len, flags))}" if flags else ""
-
-
 def _thresholds(rows: Rows, limits: AcceptanceConfig) -> str:
     """Table of returned boxes for other limits of the probability of a box that is not worse."""
     head = f"better from {limits.min_probability_better:g}, not worse from", *(f"{least:g}" for least in THRESHOLDS)
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    for (root, detector), row in rows.items():
-        cells = []
-        for least in THRESHOLDS:
-            other = replace(limits, min_probability_not_worse=least)
-            cells.append(_returned(row, other))
-        lines.append(f"| {root} {detector} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+    others = [replace(limits, min_probability_not_worse=least) for least in THRESHOLDS]
+    return markdown_table(
+        head, [[" ".join(of), *(_returned(row, other) for other in others)] for of, row in rows.items()]
+    )
 
 
 def _cell(cars: Sequence[Judged], after: Sequence[Array], with_spread: bool = True) -> str:
@@ -216,7 +203,7 @@ def _reliability(rows: Rows) -> str:
         (probabilities(cars, row.model.car_is_there), outcomes(cars)) for row in rows.values() for cars in row.cars
     ]
     predicted, true = (np.concatenate(x) for x in zip(*pairs, strict=True))
-    lines = ["| predicted | better: predicted, true (cars) | not worse: predicted, true (cars) |", "|---|---|---|"]
+    lines = []
     for low, high in pairwise(BINS):
         cells = []
         for column in range(2):
@@ -225,27 +212,28 @@ def _reliability(rows: Rows) -> str:
                 f"{predicted[within, column].mean():.2f}, {true[within, column].mean():.2f}" if within.any() else ""
             )
             cells.append(f"{figures} ({within.sum()})")
-        lines.append(f"| {low:g} to {high:g} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        lines.append([f"{low:g} to {high:g}", *cells])
+    head = "predicted", "better: predicted, true (cars)", "not worse: predicted, true (cars)"
+    return markdown_table(head, lines)
 
 
 def _coverage(rows: Rows) -> str:
     """Table of median true errors divided by the given standard deviations; 1 is right."""
-    lines = ["| true over given sigma | " + " | ".join(CAR_QUANTITIES[:4]) + " |", "|---|---|---|---|---|"]
+    lines = []
     for (root, detector), row in rows.items():
         standard = np.concatenate([cars.standard for cars in row.cars])
         ratio = np.median(np.abs(standard[:, :4]), axis=0) * _TO_SIGMA
-        lines.append(f"| {root} {detector} | " + " | ".join(f"{x:.2f}" for x in ratio) + " |")
-    return "\n".join(lines)
+        lines.append([f"{root} {detector}", *(f"{x:.2f}" for x in ratio)])
+    return markdown_table(("true over given sigma", *CAR_QUANTITIES[:4]), lines)
 
 
 def _noises(models: Mapping[str, TrustModel]) -> str:
-    rows = ["| images off by | " + " | ".join(CAR_QUANTITIES) + " | weights |", "|" + "---|" * 9]
+    rows = []
     for name, model in {**models, "package": bundled_trust_model()}.items():
         values = [f"{factor:.2f}, {floor:.3f} m" for factor, floor in zip(*model.image_noise, strict=True)]
         weights = ", ".join(f"{weight:.2f}" for weight in (*model.car_is_there.weights, model.car_is_there.bias))
-        rows.append(f"| {name} | " + " | ".join([*values, weights]) + " |")
-    return "\n".join(rows)
+        rows.append([name, *values, weights])
+    return markdown_table(("images off by", *CAR_QUANTITIES, "weights"), rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

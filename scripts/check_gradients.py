@@ -7,10 +7,9 @@ excluded and counted. A user's own term, `--term module:factory`, is examined li
 checked. The exit code is 1 if a bound is broken: analytic against autograd 1e-9, against numeric 1e-6, relative to the
 norm of the row, float64; less than 2 percent excluded in the typical regime.
 
-    python scripts/check_gradients.py --out gradients
+    python scripts/check_gradients.py > gradients.md
     python scripts/check_gradients.py --term photometric silhouettes --regime typical near_3m --states 12
     python scripts/check_gradients.py --term my_terms:upright --regime typical
-    python scripts/check_gradients.py --data KITTI --frame 000107 --out gradients_kitti
 
 docs/gradients.md explains the columns.
 """
@@ -20,25 +19,22 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
+from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path
 
 import torch
-from command_line import run_command
+from command_line import markdown_table, run_command
 
 from directshape_torch.errors import InputError
-from directshape_torch.laboratory.regimes import regimes_named
+from directshape_torch.laboratory.bench import TERM_NAMES, TRACK_NAMES, Bench
+from directshape_torch.laboratory.comparison import BOUNDS, Comparison, compare
+from directshape_torch.laboratory.experiments import AT_FIXED_DEPTHS, gradient_experiment, term_experiment
+from directshape_torch.laboratory.regimes import REGIMES
 from directshape_torch.laboratory.scenes import load_scene
-from directshape_torch.laboratory.study import (
-    SUBJECT_NAMES,
-    StudyPlan,
-    run_study,
-    subjects_named,
-    summary,
-    write_report,
-)
 from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.shape.pca_prior import PCAShapePrior
+
+SUBJECT_NAMES = (*TERM_NAMES, *TRACK_NAMES)
 
 
 def load_factory(name: str) -> TermFactory:
@@ -57,30 +53,89 @@ def load_factory(name: str) -> TermFactory:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Examine, print and write; return the exit code.
+    """Examine and print; return the exit code.
 
     Raises:
-        DirectShapeError: a name is unknown, a term has wrong shapes, or a data set cannot be read.
+        DirectShapeError: a name is unknown, a term has wrong shapes, or no regime has any of the terms.
     """
     if args.states < 1:
         raise InputError("--states", "at least 1", f"{args.states}")
-    names = SUBJECT_NAMES if args.term is None else args.term
-    plan = StudyPlan(
-        subjects=subjects_named([name for name in names if ":" not in name]),
-        own_terms=tuple(load_factory(name) for name in names if ":" in name),
-        regimes=tuple(regimes_named(args.regime)),
-        num_states=args.states,
-        seed=args.seed,
-        pixels_per_car=args.pixels,
-        second=args.second,
-    )
-    scene = load_scene(args.data, args.frame, args.detections, args.masks)
-    prior = (PCAShapePrior.load_bundled() if args.prior is None else PCAShapePrior.load(args.prior)).double()
-    study = run_study(scene, prior, plan, report=lambda line: print(line, file=sys.stderr))
-    print(summary(scene.source, plan, study), end="")
-    if args.out is not None:
-        write_report(args.out, scene.source, plan, study)
-    return 1 if study.broken_bounds() else 0
+    subjects = [name for name in args.term if ":" not in name]
+    for what, known, names in (("term", SUBJECT_NAMES, subjects), ("regime", REGIMES, args.regime)):
+        if unknown := [name for name in names if name not in known]:
+            raise InputError(what, f"one of {', '.join(known)}", repr(unknown[0]))
+    own_terms = [load_factory(name) for name in args.term if ":" in name]
+    scene, prior = load_scene(), PCAShapePrior.load_bundled().double()
+    comparisons: list[Comparison] = []
+    notes = []
+    for regime in args.regime:
+        bench = Bench.build(scene, prior, REGIMES[regime], args.states, 0, args.pixels, own_terms)
+        if empty := int((bench.rays_per_car == 0).sum()):
+            notes.append(f"{regime}: {empty} of {args.states} states see no valid pixel; only their priors count.")
+        own = [name for name in bench.terms if name not in SUBJECT_NAMES]
+        found = compare_subjects(bench, [*subjects, *own], args.second)
+        comparisons += found
+        worst = max((c.errors["analytic-numeric"] for c in found), default=0.0)
+        print(f"{regime}: {len(found)} subjects, analytic-numeric at most {worst:.0e}", file=sys.stderr)
+    if not comparisons:
+        expected = f"one that has {', '.join(subjects)}"
+        raise InputError("regime", expected, ", ".join(args.regime), "examine it in track")
+    broken = [sentence for c in comparisons for sentence in c.broken_bounds()]
+    parts = [
+        "# Jacobians three ways",
+        f"Images: the bundled demo frame. {args.states} states in each of {len(args.regime)} regimes, seed 0. "
+        "Errors are relative to the norm of the row. Bounds in float64: "
+        + ", ".join(f"{pair} {bound:.0e}" for pair, bound in BOUNDS.items())
+        + ".",
+        "**All bounds hold.**" if not broken else "**Broken bounds:**\n\n" + "\n".join(f"- {b}" for b in broken),
+        *notes,
+        "## Largest errors over all regimes, float64",
+        worst_table(comparisons),
+        "## Entries that differences cannot judge",
+        exclusion_table(comparisons),
+    ]
+    print("\n\n".join(parts))
+    return 1 if broken else 0
+
+
+@torch.no_grad()
+def compare_subjects(bench: Bench, names: Sequence[str], second: bool) -> list[Comparison]:
+    """Compare three Jacobians of the named terms at the states of a bench; `second` adds the terms' gradients."""
+    terms = [name for name in names if name in bench.terms]
+    experiments = [term_experiment(bench, terms)] if terms else []
+    twice = [name for name in terms if name not in AT_FIXED_DEPTHS]
+    experiments += [gradient_experiment(bench, twice)] if second and twice else []
+    return [c for experiment in experiments for c in compare(experiment, bench.regime.name)]
+
+
+def worst_table(comparisons: Sequence[Comparison]) -> str:
+    """Table of the largest errors of each subject."""
+    rows = []
+    for name in dict.fromkeys(c.name for c in comparisons):
+        own = [c for c in comparisons if c.name == name]
+        errors = [f"{max(c.errors[pair] for c in own):.1e}" for pair in BOUNDS]
+        worst = max(own, key=lambda c: c.errors["analytic-numeric"]).regime
+        excluded = sum(sum(c.excluded.values()) for c in own)
+        share = f"{excluded} ({100 * excluded / max(1, sum(c.entries for c in own)):.2f} %)"
+        rows.append([name, sum(c.compared for c in own), share, *errors, worst])
+    return markdown_table(["subject", "compared", "excluded", *BOUNDS, "worst regime (numeric)"], rows)
+
+
+def exclusion_table(comparisons: Sequence[Comparison]) -> str:
+    """Table of the excluded entries of each regime, with reasons."""
+    rows = []
+    for regime in dict.fromkeys(c.regime for c in comparisons):
+        own = [c for c in comparisons if c.regime == regime]
+        counts: Counter[str] = Counter()
+        for c in own:
+            counts.update(c.excluded)
+        entries = sum(c.entries for c in own)
+        worst = max(own, key=lambda c: c.excluded_share)
+        reasons = ", ".join(f"{reason} {count}" for reason, count in counts.most_common())
+        most = f"{worst.name} {100 * worst.excluded_share:.2f} %"
+        share = f"{100 * counts.total() / max(entries, 1):.2f} %"
+        rows.append([regime, REGIMES[regime].explanation, entries, share, most, reasons or "none"])
+    return markdown_table(["regime", "states", "entries", "excluded", "most in", "why"], rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -89,15 +144,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--states", type=int, default=8, metavar="N", help="states in each regime (default 8: a minute)"
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="for jacobians.csv and summary.md")
-    parser.add_argument("--term", nargs="+", metavar="NAME", help="default all; module:factory for one of your own")
-    parser.add_argument("--regime", nargs="+", metavar="NAME", help="default all")
-    parser.add_argument("--data", type=Path, metavar="ROOT", help="KITTI's layout; default the bundled demo frame")
-    parser.add_argument("--frame", metavar="ID", help="frame of --data; default the one with most masked cars")
-    parser.add_argument("--detections", type=Path, metavar="DIR", help="default the first folder in ROOT/detections")
-    parser.add_argument("--masks", type=Path, metavar="DIR", help="default ROOT/training/masks")
-    parser.add_argument("--prior", type=Path, metavar="FILE", help="default the bundled shape prior")
-    parser.add_argument("--seed", type=int, default=0)
+    own = "default all; module:factory for one of your own"
+    parser.add_argument("--term", nargs="+", default=SUBJECT_NAMES, metavar="NAME", help=own)
+    parser.add_argument("--regime", nargs="+", default=list(REGIMES), metavar="NAME", help="default all")
     parser.add_argument("--pixels", type=int, default=24, metavar="N", help="pixels per car and side (default 24)")
     parser.add_argument("--second", action=argparse.BooleanOptionalAction, default=True, help="second derivatives too")
     torch.set_num_threads(1)  # the operations are small, and threads would spin

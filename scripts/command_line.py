@@ -1,10 +1,10 @@
-"""This module runs a script and gives its exit code, with one line for input that it cannot use."""
+"""This module has what scripts share: the run with its exit code, and tables in Markdown."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from directshape_torch.errors import DirectShapeError
 
@@ -27,3 +27,9 @@ def run_command(
     except DirectShapeError as error:
         print(f"error: {error}", file=sys.stderr)
         return WRONG_USE
+
+
+def markdown_table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> str:
+    """Lines of a table in Markdown from its head and its rows, without a line end."""
+    first, *rest = ("| " + " | ".join(map(str, row)) + " |" for row in (head, *rows))
+    return "\n".join([first, "|" + "---|" * len(head), *rest])

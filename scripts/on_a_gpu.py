@@ -18,8 +18,7 @@ from pathlib import Path
 
 import torch
 from benchmark import machine
-from benchmark_suites.measures import count_operations, peak_tensor_bytes
-from benchmark_suites.timing import time_interleaved
+from benchmark_suites.measures import count_operations, peak_tensor_bytes, time_interleaved
 from benchmark_suites.workloads import demo_scene
 from command_line import run_command
 from torch import Tensor

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import align_boxes
 import numpy as np
-from command_line import run_command
+from command_line import markdown_table, run_command
 
 from directshape_torch.cli.main import main as directshape
 from directshape_torch.errors import DirectShapeError, InputError
@@ -129,7 +129,7 @@ def run(args: argparse.Namespace) -> None:
             found = comparison(args, name)
             ap = ap_cells(args, folder_of(args, name) / "data")
             lines.append([name, *box_cells(found, "after"), difference(first, found), *ap])
-    table = "\n".join(["| " + " | ".join(line) + " |" for line in (HEAD, ["---"] * len(HEAD), *lines)]) + "\n"
+    table = markdown_table(HEAD, lines) + "\n"
     (args.out / f"{args.table}.md").write_text(table, encoding="utf-8")
     print(table, end="")
 

@@ -38,7 +38,7 @@ NEAR_SPREADS_M = (0.01, 0.03, 0.1)
 # zero level.
 SURFACE_BAND_M, FAR_WEIGHT = 0.15, 0.05
 CARS_PER_STEP, POINTS_PER_CAR = 128, 64
-CODE_PENALTY = 1e-4
+CODE_PENALTY, RATE = 1e-4, 3e-3
 
 
 @dataclass(frozen=True)
@@ -64,33 +64,22 @@ def sample_points(seed: int) -> tuple[Array, Array]:
     return points, car_sdf(car, points)
 
 
-def make_cars(num_cars: int, kept: Path | None) -> TrainingCars:
-    """The cars with seeds from 0, read from the file `kept` if it exists, else written to it."""
-    if kept is not None and kept.exists():
-        with np.load(kept, allow_pickle=False) as file:
-            return TrainingCars(*(torch.from_numpy(file[name]) for name in ("points", "sdf", "grids")))
-    points, sdf, grids = [], [], []
-    for seed in tqdm(range(num_cars), desc="cars", unit="car"):
-        grids.append(sample_grid(seed))
-        sample = sample_points(seed)
-        points.append(sample[0].astype(np.float32))
-        sdf.append(sample[1].astype(np.float32))
-    arrays = {"points": np.stack(points), "sdf": np.stack(sdf), "grids": np.stack(grids)}
-    if kept is not None:
-        np.savez(kept, **arrays)
-    return TrainingCars(*(torch.from_numpy(array) for array in arrays.values()))
+def make_cars(num_cars: int) -> TrainingCars:
+    """The cars with seeds from 0."""
+    cars = [(*sample_points(seed), sample_grid(seed)) for seed in tqdm(range(num_cars), desc="cars", unit="car")]
+    return TrainingCars(*(torch.from_numpy(np.stack(part).astype(np.float32)) for part in zip(*cars, strict=True)))
 
 
 def train(
-    cars: TrainingCars, prior: NeuralShapePrior, code: Tensor, num_steps: int, rate: float, generator: torch.Generator
+    cars: TrainingCars, prior: NeuralShapePrior, code: Tensor, num_steps: int, generator: torch.Generator
 ) -> Tensor:
     """Train the prior in place; return the learned codes (N, K)."""
     code = code.clone().requires_grad_()
-    optimiser = torch.optim.Adam([*prior.parameters(), code], lr=rate)
+    optimiser = torch.optim.Adam([*prior.parameters(), code], lr=RATE)
     progress = tqdm(range(num_steps), desc="steps", unit="step")
     for step in progress:
         for group in optimiser.param_groups:
-            group["lr"] = rate * min(1.0, step / 100) * 0.5 * (1 + math.cos(math.pi * step / num_steps))
+            group["lr"] = RATE * min(1.0, step / 100) * 0.5 * (1 + math.cos(math.pi * step / num_steps))
         loss = _loss(cars, prior, code, generator)
         optimiser.zero_grad()
         loss.backward()
@@ -145,14 +134,12 @@ def main() -> None:
     parser.add_argument("--num-codes", type=int, default=8)
     parser.add_argument("--layer-widths", type=int, nargs="+", default=[64, 64, 64])
     parser.add_argument("--steps", type=int, default=6000)
-    parser.add_argument("--rate", type=float, default=3e-3)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--cars", type=Path, help="npz file that keeps the sampled cars for another training")
     default = Path(__file__).parents[1] / "directshape_torch" / "assets" / "neural_prior.safetensors"
     parser.add_argument("--out", type=Path, default=default)
     args = parser.parse_args()
     torch.manual_seed(args.seed)
-    cars = make_cars(args.num_cars, args.cars)
+    cars = make_cars(args.num_cars)
     provenance = PriorProvenance(
         made_by="scripts/train_neural_prior.py of directshape_torch, from parametric cars with seeds from 0",
         licence="Apache-2.0",
@@ -163,7 +150,7 @@ def main() -> None:
     prior = NeuralShapePrior(args.layer_widths, args.num_codes, origin, GRID.shape, GRID.spacing_m, provenance)
     prior.requires_grad_()
     start = training_codes(cars.grids, args.num_codes).float()
-    code = train(cars, prior, start, args.steps, args.rate, torch.Generator().manual_seed(args.seed))
+    code = train(cars, prior, start, args.steps, torch.Generator().manual_seed(args.seed))
     prior.requires_grad_(False)
     residual = fit_dimensions(prior, whiten(prior, code), cars.grids)
     prior.save(args.out)

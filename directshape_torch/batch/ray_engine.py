@@ -29,6 +29,8 @@ from directshape_torch.io.run_manifest import hash_file
 _ANSWER_S = 5.0
 # A node that imports PyTorch for the first time from a network disk is slow.
 _CHECK_S = 300.0
+# These errors of Ray say that a process, or what it had made, is gone.
+_DEATHS = "WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "LocalRayletDiedError", "ObjectLostError"
 
 
 @dataclass(frozen=True)
@@ -104,8 +106,10 @@ class RayEngine:
             if isinstance(error.cause, DirectShapeError):
                 raise error.cause from None
             raise DirectShapeError(_last_line(error)) from error
-        except self._ray.exceptions.RayError:
-            return None
+        except self._ray.exceptions.RayError as error:
+            if isinstance(error, tuple(getattr(self._ray.exceptions, name) for name in _DEATHS)):
+                return None
+            raise DirectShapeError(f"the cluster failed: {_last_line(error)}") from error
 
     def __enter__(self) -> Self:
         return self

@@ -284,3 +284,29 @@ class PriorArrays(NamedTuple):
     detector_T_cam_obj: Reals  # (B, 4, 4)
     pose_sigma: Reals  # (B, 4)
     offset_sigma_px: Reals  # (B, S)
+
+
+class SeenFromAbove(NamedTuple):
+    """`SeenFromAbove` holds the fields of `start.rectangle_fit.InstancePoints`."""
+
+    xz: Reals  # (M, P, 2)
+    weight: Reals  # (M, P)
+    middle: Reals  # (M, 2)
+    outline: Reals  # (M, 2)
+    is_end_seen: Flags  # (M, 2)
+
+
+class RectangleRules(NamedTuple):
+    """`RectangleRules` are the constants of `start.rectangle_fit`."""
+
+    num_iterations: int
+    damping: float
+    largest_step: Doubles  # (5,)
+    mean_size: tuple[float, float]  # length and width, metres
+    size_sigma: tuple[float, float]
+    size_weight: float
+    point_scale: float
+    outline_scale: float
+    outline_weight: float
+    corners: Doubles  # (8, 2) in lengths and widths
+    least_depth: float

@@ -78,7 +78,7 @@ def _is_installed() -> bool:
         )
         return False
     if not jit.is_compiled(march.march):
-        _logger.warning("Numba compiles native loops once on this machine, which takes some 40 seconds")
+        _logger.warning("Numba compiles native loops once on this machine, which takes some 25 seconds")
     return True
 
 

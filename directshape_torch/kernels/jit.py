@@ -25,10 +25,13 @@ SOURCES = zlib.crc32(b"".join(path.read_bytes() for path in _FILES))
 """This number changes with the sources of this package."""
 
 
+# A division by zero gives infinity or NaN, as it does in tensors. Nobody calls the functions from C.
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+
+
 def loop(function: _FunctionT) -> _FunctionT:
     """Compile a function that Python calls, and keep its code on the disk; other threads run while it works."""
-    # A division by zero gives infinity or NaN, as it does in tensors.
-    compiled = cast(_FunctionT, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    compiled = cast(_FunctionT, numba.njit(cache=True, **_OPTIONS)(function))
     _drop_older(compiled)
     return compiled
 
@@ -55,5 +58,9 @@ def is_compiled(function: Callable[..., object]) -> bool:
 
 
 def step(function: _FunctionT) -> _FunctionT:
-    """Compile a function that a loop calls."""
-    return cast(_FunctionT, numba.njit(nogil=True, forceinline=True, error_model="numpy")(function))
+    """Compile a function that only loops call: Python must not call it, because it gets no wrapper.
+
+    Wrappers of all steps would take a third of the time of compilation.
+    """
+    options = {**_OPTIONS, "forceinline": True, "no_cpython_wrapper": True}
+    return cast(_FunctionT, numba.njit(**options)(function))

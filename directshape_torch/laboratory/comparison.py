@@ -35,7 +35,6 @@ class Comparison:
     entries: int  # rows times unknowns
     compared: int  # entries that differences could judge
     excluded: Mapping[str, int]  # by reason, entries that differences could not judge
-    zero_rows: int  # rows whose Jacobian is exactly zero, also by a skip rule of the residual
     errors: Mapping[str, float]  # the largest of each pair of `BOUNDS`, relative
     value_error: float = 0.0  # see `Subject.value_error`
 
@@ -47,7 +46,7 @@ class Comparison:
         """One sentence for each bound that does not hold.
 
         Examples:
-            >>> bad = Comparison("warp", "typical", 2, 2, {}, 0, {"analytic-numeric": 0.5})
+            >>> bad = Comparison("warp", "typical", 2, 2, {}, {"analytic-numeric": 0.5})
             >>> bad.broken_bounds()
             ['warp, typical: analytic-numeric error 5.0e-01 above 1e-06']
         """
@@ -90,7 +89,6 @@ def _compare(subject: Subject, found: DifferenceSweep, regime: str) -> Compariso
         entries=subject.analytic.numel(),
         compared=int(judged.sum()) + len(constant_errors),
         excluded={reason: n for reason, n in excluded.items() if n},
-        zero_rows=int((~moving).sum()),
         errors={
             "analytic-autograd": _largest(by_autograd[moving]),
             "analytic-numeric": _largest(torch.cat([by_differences[judged], constant_errors])),

@@ -58,7 +58,7 @@ def term_experiment(bench: Bench, names: Sequence[str]) -> Experiment:
     """
     terms = [bench.terms[name] for name in names]
     rows = [bench.rows[name] for name in names]
-    counts = [_counts(term, at) for term, at in zip(terms, rows, strict=True)]
+    counts = [(term.row_weight > 0).expand_as(at.residual) for term, at in zip(terms, rows, strict=True)]
     witness = by_autograd(terms, bench.problem.prior, bench.state, [at.anchor for at in rows])
 
     def evaluate(delta: Tensor) -> list[Tensor]:
@@ -111,10 +111,6 @@ def row_gradients(term: Term[AnchorT], at: Linear[AnchorT]) -> Tensor:
     """Part (M, R, D) that each row adds to the gradient of its car, before the weight of its block."""
     inner = (term.row_weight * term.norm(at.residual).gradient_weight * at.J_residual_inner).sum(dim=-1)
     return inner[..., None] * at.J_inner_state
-
-
-def _counts(term: Term[AnchorT], at: Linear[AnchorT]) -> Tensor:
-    return (term.row_weight > 0).expand_as(at.residual)
 
 
 def _units(bench: Bench) -> Tensor:

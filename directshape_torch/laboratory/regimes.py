@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import AcceptanceConfig, RefinerConfig, RigConfig
-from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.laboratory.scenes import LaboratoryScene, place_cars, select_detections
+from directshape_torch.laboratory.scenes import LaboratoryScene, place_cars
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene.detections import Detections
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -61,8 +60,7 @@ class Draw(NamedTuple):
         """Repeated detections of the frame, at random states near the given poses and codes."""
         rows = torch.arange(self.num_states) % len(T_cam_obj)
         start = CarState.of(se3.inverse(T_cam_obj[rows]), code[rows])
-        detections = select_detections(self.scene.detections, rows)
-        return DrawnStates(detections, self.disturbed(start, metres, degrees, sigma))
+        return DrawnStates(self.scene.detections.rows(rows), self.disturbed(start, metres, degrees, sigma))
 
     def placed(
         self, x_m: Tensor, z_m: Tensor, yaw_rad: Tensor, code: Tensor | None = None, disturb: bool = True
@@ -186,30 +184,6 @@ REGIMES: Mapping[str, Regime] = {
         Regime("track", "two or more views of one car, off by 0.15 m, 2 deg, code N(0, 0.8), with any path", _track),
     )
 }  # fmt: skip
-
-
-def regimes_named(names: list[str] | None) -> list[Regime]:
-    """The regimes with the given names, or all regimes for None.
-
-    Raises:
-        InputError: a name is unknown; the error lists the known names.
-
-    Examples:
-        >>> [r.name for r in regimes_named(["far_80m"])]
-        ['far_80m']
-    """
-    return [REGIMES[checked_name("regime", name, list(REGIMES))] for name in names or REGIMES]
-
-
-def checked_name(what: str, name: str, known: list[str]) -> str:
-    """Return the name if it is known.
-
-    Raises:
-        InputError: the name is unknown; the error lists the known names.
-    """
-    if name not in known:
-        raise InputError(what, f"one of {', '.join(known)}", repr(name))
-    return name
 
 
 def seeded(seed: int, regime: Regime) -> torch.Generator:

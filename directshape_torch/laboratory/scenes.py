@@ -1,14 +1,13 @@
-"""This module gives the laboratory real images: frames of a data set, and cars placed into them."""
+"""This module gives the laboratory real images: the bundled frame, and cars placed into it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.geometry.projection import project, rays_from_pixels, right_rays
@@ -34,60 +33,20 @@ class LaboratoryScene:
 
     frame: FrameBatch
     detections: Detections
-    source: str
 
 
-def load_scene(
-    data: Path | None = None,
-    frame_id: str | None = None,
-    detections_dir: Path | None = None,
-    masks: Path | None = None,
-) -> LaboratoryScene:
-    """The bundled demo frame, or a frame of a data set in KITTI's layout.
-
-    Args:
-        data: folder that holds `training/`; None for the bundled frame.
-        frame_id: id of the frame. Default: the frame with most cars that have masks in both images.
-        detections_dir: folder of detections. Default: the first folder in `detections` of the data set.
-        masks: folder of masks. Default: `training/masks` of the data set.
-
-    Raises:
-        DataFormatError: a folder is missing or damaged.
-        InputError: no frame with a car that has masks.
+def load_scene() -> LaboratoryScene:
+    """The bundled demo frame with its detections that have masks in both images.
 
     Examples:
         >>> load_scene().detections.T_cam_obj.dtype
         torch.float64
     """
-    root = DEMO_FOLDER if data is None else data
-    detections_dir = detections_dir or _detections_folder(root)
-    dataset = open_dataset("kitti", root, detections_dir, masks or root / "training" / "masks", dtype=torch.float64)
-    frames = dataset.frame_ids if frame_id is None else (frame_id,)
-    best, most = None, 0
-    for name in frames:
-        loaded = dataset.load(name)
-        d = loaded.detections
-        both = d.has_mask_left & d.has_mask_right
-        if int(both.sum()) > most:
-            best, most = (
-                LaboratoryScene(loaded.frame, select_detections(d, both.nonzero()[:, 0]), name),
-                int(both.sum()),
-            )
-    if best is None:
-        raise InputError("data", f"a frame of {root} with a car that has masks in both images", "none")
-    return replace(best, source=f"{'the bundled demo' if data is None else data.name} frame {best.source}")
-
-
-def _detections_folder(root: Path) -> Path:
-    folders = sorted(path for path in (root / "detections").glob("*") if path.is_dir())
-    if not folders:
-        raise DataFormatError(root / "detections", "holds no folder of detections", cure="give a folder <name>/data")
-    return folders[0]
-
-
-def select_detections(d: Detections, rows: Tensor) -> Detections:
-    """The detections `rows`, in the order of `rows`, which may repeat; other instances stay as occluders."""
-    return d.rows(rows)
+    detections = DEMO_FOLDER / "detections" / "noisy_stereo"
+    dataset = open_dataset("kitti", DEMO_FOLDER, detections, DEMO_FOLDER / "training" / "masks", dtype=torch.float64)
+    loaded = dataset.load(dataset.frame_ids[0])
+    has_both = loaded.detections.has_mask_left & loaded.detections.has_mask_right
+    return LaboratoryScene(loaded.frame, loaded.detections.rows(has_both.nonzero()[:, 0]))
 
 
 def place_cars(

@@ -67,7 +67,8 @@ def iterate_natively(
     if type(prior) is not PCAShapePrior or type(progress.state) is not CarState or config.accept_every_step:
         return None
     state, candidate = (CarState(*map(_copied, progress.state)) for _ in range(2))
-    field = prior.bind(candidate.code)
+    # `propose` writes the grids of candidates before a loop reads them.
+    field = prior.unfilled(len(candidate.code))
     grid = native_grid(field, candidate.T_obj_cam)
     if grid is None:
         return None

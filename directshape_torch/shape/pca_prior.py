@@ -117,6 +117,11 @@ class PCAShapePrior(nn.Module):
         """The fields of B objects with codes (B, K): the basis is summed up into one grid for each object."""
         return GridShape.of(self.values(code), self.basis, self.origin, self.spacing_m)
 
+    def unfilled(self, num_objects: int) -> GridShape:
+        """The fields of B objects, whose distances at the nodes are still to be written."""
+        values = self.mean.new_empty(num_objects, *self.mean.shape)
+        return GridShape.of(values, self.basis, self.origin, self.spacing_m)
+
     @in_full_precision
     def dimensions_and_derivative(self, code: Tensor) -> DimensionsDerivative:
         """Height, width and length (B, 3), metres, by a linear map fitted to training cars, and their derivative."""

@@ -21,7 +21,7 @@ from directshape_torch.start.mask_points import (
     rows_of_height,
 )
 from directshape_torch.start.rectangle_fit import MEAN_HWL, InstancePoints, distance_outside, fit_rectangles, outline_of
-from directshape_torch.stereo_matching.disparity import with_disparity
+from directshape_torch.stereo_matching.disparity import LEAST_HEIGHT_M, with_disparity
 
 # A mask with fewer known disparities, or with a smaller share of them, shows no car.
 _FEWEST_POINTS, _LEAST_KNOWN_SHARE = 30, 0.1
@@ -30,7 +30,7 @@ _REACH_M = 4.5
 # Bumpers and doors are near the rectangle of a car; wheels, bonnet and windows count for less.
 _BAND_M, _OFF_BAND_WEIGHT = (0.25, 1.0), 0.1
 # Height and width in the image, and distance, that the mask of a car can have.
-_HEIGHT_M, _WIDTH_M, _DEPTH_M = (0.4, 2.4), (0.5, 6.5), (2.0, 80.0)
+_HEIGHT_M, _WIDTH_M, _DEPTH_M = (LEAST_HEIGHT_M, 2.4), (0.5, 6.5), (2.0, 80.0)
 # A mask higher than a passenger car shows a mirror image below the road, which may be known as badly as this.
 _CAR_HEIGHT_M, _ROAD_M = 2.0, 0.2
 # Median height of a car's points above the road, which may be known badly, and median deviation from it.

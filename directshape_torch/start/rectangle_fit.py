@@ -11,8 +11,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from directshape_torch.kernels.arguments import RectangleRules, SeenFromAbove
+from directshape_torch.kernels.choice import array, takes_loops
 
 MEAN_HWL = (1.52, 1.63, 3.88)
 """These are the height, width and length of the mean car of KITTI's labels, metres."""
@@ -31,6 +35,22 @@ _OUTLINE_WEIGHT = 0.3
 _SIZE_WEIGHT, _SIZE_SIGMA_M = 0.002, (0.4, 0.1)
 _LARGEST_STEP = (0.5, 0.5, 0.2, 0.3, 0.1)
 _DAMPING = 1e-4
+# A corner has at least this depth, metres.
+_LEAST_DEPTH_M = 0.5
+_CORNERS = [(i * a, k * b) for a, b in _OCTAGON for i in (1, -1) for k in (1, -1)]
+_RULES = RectangleRules(
+    _NUM_ITERATIONS,
+    _DAMPING,
+    np.array(_LARGEST_STEP),
+    (MEAN_HWL[2], MEAN_HWL[1]),
+    _SIZE_SIGMA_M,
+    _SIZE_WEIGHT,
+    _POINT_SCALE_M,
+    _OUTLINE_SCALE_M,
+    _OUTLINE_WEIGHT,
+    np.array(_CORNERS),
+    _LEAST_DEPTH_M,
+)
 
 
 class InstancePoints(NamedTuple):
@@ -51,8 +71,7 @@ def fit_rectangles(seen: InstancePoints) -> tuple[Tensor, Tensor]:
         z of the centre, metres, heading `rotation_y`, radians, length and width, metres. Their mean robust costs
         (M, C), square metres.
     """
-    place, seen = _starts(seen), InstancePoints(*(each[:, None] for each in seen))
-    place, cost = _improved(place, seen)
+    place, cost = _improved(_starts(seen), seen)
     _, kept = cost.nan_to_num(nan=math.inf).topk(_NUM_KEPT, dim=1, largest=False)
     return _improved(place.gather(1, kept[..., None].expand(-1, -1, place.shape[-1])), seen)
 
@@ -72,6 +91,9 @@ def outline_of(place: Tensor) -> Tensor:
 
 def _improved(place: Tensor, seen: InstancePoints) -> tuple[Tensor, Tensor]:
     """The rectangles after some steps from places (M, C, 5), and their costs (M, C)."""
+    if takes_loops(place, seen.xz):
+        return _improved_natively(place, seen)
+    seen = InstancePoints(*(each[:, None] for each in seen))
     limit = place.new_tensor(_LARGEST_STEP)
     damping = _DAMPING * torch.eye(len(limit), dtype=place.dtype, device=place.device)
     for _ in range(_NUM_ITERATIONS):
@@ -80,6 +102,14 @@ def _improved(place: Tensor, seen: InstancePoints) -> tuple[Tensor, Tensor]:
         step = -torch.linalg.solve_ex(weighted.mT @ J + damping, weighted.mT @ residual[..., None])[0][..., 0]
         place = place + step.maximum(-limit).minimum(limit)
     return place, _rows(place, seen)[3]
+
+
+def _improved_natively(place: Tensor, seen: InstancePoints) -> tuple[Tensor, Tensor]:
+    from directshape_torch.kernels.rectangles import improve  # Numba may be missing.
+
+    places, costs = array(place.double()), array(place.new_empty(place.shape[:2], dtype=torch.float64))
+    improve(_RULES, SeenFromAbove(*map(array, seen)), places, costs)
+    return torch.from_numpy(places).to(place), torch.from_numpy(costs).to(place)
 
 
 def _starts(seen: InstancePoints) -> Tensor:
@@ -157,12 +187,12 @@ def _outer_corners(place: Tensor) -> tuple[Tensor, ...]:
     Of each are returned x / z, z, x and z from the centre, metres, and its place along and across the car, in lengths
     and widths.
     """
-    ends = place.new_tensor([(i * a, k * b) for a, b in _OCTAGON for i in (1, -1) for k in (1, -1)])
+    ends = place.new_tensor(_CORNERS)
     x, z, heading = (each[..., None] for each in place[..., :3].unbind(-1))
     c, s = torch.cos(heading), torch.sin(heading)
     along, across = (ends * place[..., None, 3:]).unbind(-1)
     dx, dz = c * along + s * across, c * across - s * along
-    depth = (z + dz).clamp_min(0.5)
+    depth = (z + dz).clamp_min(_LEAST_DEPTH_M)
     column = (x + dx) / depth
     outer = torch.stack([column.argmin(-1), column.argmax(-1)], dim=-1)
     return *(each.gather(-1, outer) for each in (column, depth, dx, dz)), *(each[outer] for each in ends.unbind(-1))

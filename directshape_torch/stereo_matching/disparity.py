@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -10,21 +11,26 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.errors import InputError
+from directshape_torch.geometry.stereo_depth import disparity_of_depth
 from directshape_torch.scene.frames import FrameBatch
+
+LEAST_HEIGHT_M = 0.4
+"""This is the height of the lowest thing whose mask is taken for a car, metres."""
 
 _BLOCK_SIZE_PX = 5
 _UNIQUENESS_PERCENT = 10
 _FRACTION = 16  # OpenCV counts disparity in sixteenths of a pixel
-_NUM_DISPARITIES = 192  # the largest one that is searched, a multiple of 16
-# A part of an image is matched with so many pixels around it: 16 in which disparities are looked up beside masks, and
-# 32 whose smoothness tells on those.
-_AROUND_PX = 48
+_NUM_DISPARITIES = 192  # disparities up to this are searched
+_STEP = 16  # OpenCV takes multiples of this number of disparities
+# Disparities are looked up in so many pixels around masks, and those around these tell on them by smoothness.
+_BESIDE_PX, _CONTEXT_PX = 16, 32
 
 
 def match_disparity(
     image_left: NDArray[np.uint8],  # (H, W, 3) RGB
     image_right: NDArray[np.uint8],  # (H, W, 3)
     context_px: int = 0,
+    num_disparities: int = _NUM_DISPARITIES,
 ) -> NDArray[np.float32]:  # (H, W - context)
     """Disparity of each left pixel, `u_left - u_right`, with a left-right and a uniqueness check.
 
@@ -34,7 +40,8 @@ def match_disparity(
 
     Args:
         image_left, image_right: rectified pair, RGB uint8 of one size.
-        context_px: this many of the first columns, at most 192, are matched with others only.
+        context_px: this many of the first columns, at most `num_disparities`, are matched with others only.
+        num_disparities: disparities below this are searched; a multiple of 16.
 
     Returns:
         Disparity in pixels, NaN where unknown.
@@ -43,14 +50,14 @@ def match_disparity(
 
     _check_pair(image_left, image_right)
     # The padding keeps the leftmost columns, whose matches lie outside of the right image for large disparities only.
-    pad = (0, 0, _NUM_DISPARITIES - context_px, 0, cv2.BORDER_REPLICATE)
+    pad = (0, 0, num_disparities - context_px, 0, cv2.BORDER_REPLICATE)
     left, right = (
         cv2.copyMakeBorder(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), *pad)
         for image in (image_left, image_right)
     )
     matcher = cv2.StereoSGBM_create(  # type: ignore[attr-defined]
         minDisparity=0,
-        numDisparities=_NUM_DISPARITIES,
+        numDisparities=num_disparities,
         blockSize=_BLOCK_SIZE_PX,
         P1=8 * _BLOCK_SIZE_PX**2,
         P2=32 * _BLOCK_SIZE_PX**2,
@@ -61,7 +68,7 @@ def match_disparity(
         speckleRange=2,
         mode=cv2.STEREO_SGBM_MODE_HH4,
     )
-    sixteenths = matcher.compute(left, right)[:, _NUM_DISPARITIES:]
+    sixteenths = matcher.compute(left, right)[:, num_disparities:]
     disparity = np.asarray(sixteenths, dtype=np.float32) / np.float32(_FRACTION)
     disparity[disparity <= 0] = np.nan
     return disparity
@@ -87,40 +94,82 @@ def with_disparity(frames: FrameBatch, frame_index: Tensor | None = None, extent
         frame_index: (M,) numbers of the frames to match, in any order and number; other frames get NaN. None means all.
         extents: (M, 4) the parts of these frames to match (u0, v0, u1, v1), half open; what is far from all parts gets
             NaN. As much is matched below a part as the part is high, because the lower end of a car may be hidden
-            there. None means whole frames.
+            there. Disparities are searched up to that of something so near that a car would be higher than the part.
+            None means whole frames, and all disparities.
     """
     if frames.disparity is not None:
         return frames
     maps = torch.full_like(frames.images_left[:, 0], torch.nan)
+    largest = None if frame_index is None or extents is None else _largest_disparities(frames, frame_index, extents)
     for k, (height, width) in enumerate(frames.sizes.tolist()):
-        parts = [[0, 0, width, height]]
+        parts = [_Part(0, 0, width, height, _NUM_DISPARITIES)]
         if frame_index is not None:
             is_here = frame_index == k
-            parts = parts[: int(is_here.any())] if extents is None else extents[is_here].tolist()
-        for u0, v0, u1, v1 in _apart(parts, height, width):
-            first = max(u0 - _NUM_DISPARITIES, 0)
+            parts = parts[: int(is_here.any())]
+            if extents is not None and largest is not None:
+                parts = _parts(extents[is_here].tolist(), largest[is_here].tolist(), height, width)
+        for part in parts:
+            u0, v0, u1, v1 = part.grown(_CONTEXT_PX, height, width)[:4]
+            first = max(u0 - part.num_disparities, 0)
             left, right = (rgb8(x[k, :, v0:v1, first:u1]) for x in (frames.images_left, frames.images_right))
-            maps[k, v0:v1, u0:u1] = torch.from_numpy(match_disparity(left, right, context_px=u0 - first)).to(maps)
+            found = torch.from_numpy(match_disparity(left, right, u0 - first, part.num_disparities))
+            rows, columns = slice(part.v0 - v0, part.v1 - v0), slice(part.u0 - u0, part.u1 - u0)
+            maps[k, part.v0 : part.v1, part.u0 : part.u1] = found[rows, columns].to(maps)
     return replace(frames, disparity=maps)
 
 
-def _apart(parts: list[list[int]], height: int, width: int) -> list[list[int]]:
-    """Rectangles around parts of an image and the pixels around them; those that overlap are united."""
-    apart: list[list[int]] = []
-    for u0, v0, u1, v1 in parts:
+def _largest_disparities(frames: FrameBatch, frame_index: Tensor, extents: Tensor) -> Tensor:
+    """The disparities (M,) that are searched in parts, whose height is at least that of the lowest car."""
+    camera, corner = frames.camera, extents[:, 2:].to(frames.images_left)
+    K_left, height = camera.K_left[frame_index], (extents[:, 3] - extents[:, 1]).clamp_min(1)
+    depth = LEAST_HEIGHT_M * K_left[:, 1, 1] / height
+    nearest = disparity_of_depth(corner, depth, K_left, camera.K_right[frame_index], camera.T_right_cam[frame_index])
+    # One step more leaves room for what the rig measures beside the true disparity.
+    steps = (nearest[:, 0].nan_to_num(nan=torch.inf) / _STEP).ceil() + 1
+    return steps.clamp(1, _NUM_DISPARITIES // _STEP).long() * _STEP
+
+
+class _Part(NamedTuple):
+    """A `_Part` of an image gets its disparities, of which those below `num_disparities` are searched."""
+
+    u0: int
+    v0: int
+    u1: int
+    v1: int
+    num_disparities: int
+
+    def grown(self, by_px: int, height: int, width: int) -> _Part:
+        """The part with some pixels around it, as far as the image has them."""
+        u0, v0 = max(self.u0 - by_px, 0), max(self.v0 - by_px, 0)
+        return _Part(u0, v0, min(self.u1 + by_px, width), min(self.v1 + by_px, height), self.num_disparities)
+
+    def with_other(self, other: _Part) -> _Part:
+        """The smallest part with both."""
+        return _Part(*map(min, self[:2], other[:2]), *map(max, self[2:], other[2:]))
+
+    @property
+    def work(self) -> int:
+        """The number of comparisons that matching makes."""
+        width, height = self.u1 - self.u0 + 2 * _CONTEXT_PX, self.v1 - self.v0 + 2 * _CONTEXT_PX
+        return (width + self.num_disparities) * height * self.num_disparities
+
+
+def _parts(extents: list[list[int]], largest: list[int], height: int, width: int) -> list[_Part]:
+    """The parts around extents, of which those are united that take longer apart, the nearest things last."""
+    parts: list[_Part] = []
+    for (u0, v0, u1, v1), num_disparities in zip(extents, largest, strict=True):
         if u0 >= u1 or v0 >= v1:
             continue
-        first, last = [max(u0 - _AROUND_PX, 0), max(v0 - _AROUND_PX, 0)], v1 + (v1 - v0) + _AROUND_PX
-        part = [*first, min(u1 + _AROUND_PX, width), min(last, height)]
-        while (other := next((each for each in apart if _overlap(each, part)), None)) is not None:
-            apart.remove(other)
-            part = [*map(min, part[:2], other[:2]), *map(max, part[2:], other[2:])]
-        apart.append(part)
-    return apart
+        part = _Part(u0, v0, u1, 2 * v1 - v0, num_disparities).grown(_BESIDE_PX, height, width)
+        while (other := next((each for each in parts if _is_less_together(each, part)), None)) is not None:
+            parts.remove(other)
+            part = part.with_other(other)
+        parts.append(part)
+    return sorted(parts, key=lambda part: part.num_disparities)
 
 
-def _overlap(a: list[int], b: list[int]) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+def _is_less_together(one: _Part, other: _Part) -> bool:
+    return one.with_other(other).work <= one.work + other.work
 
 
 def rgb8(

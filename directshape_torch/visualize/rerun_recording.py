@@ -8,19 +8,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from directshape_torch.errors import InputError, MissingDependencyError
 from directshape_torch.files.atomic_files import replaced_file
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.scene.masks import MASK_THRESHOLD
 from directshape_torch.stereo_matching.disparity import rgb8
-from directshape_torch.visualize.drawing import GREEN, GREY, Colour
+from directshape_torch.visualize.drawing import GREEN, GREY, Array, Colour
 from directshape_torch.visualize.painted_cars import ground_grid
 from directshape_torch.visualize.run_frames import RunFrame, RunInputs
 
 if TYPE_CHECKING:
     import trimesh
+    from rerun import RecordingStream
 
 _TIMELINE, _FRAMES_PER_SECOND = "frame", 3.0
 _LEFT, _RIGHT = "world/cam/image", "right/image"
@@ -40,38 +40,44 @@ def recording(path: Path, inputs: RunInputs) -> Iterator[Callable[[RunFrame], No
     if inputs.dataset is None:
         raise InputError("--data", "the data set of the run, for the pictures of a recording", "nothing")
     try:
-        import rerun
+        import rerun as rr
     except ImportError as error:
         raise MissingDependencyError("rerun-sdk", "viewer", "a Rerun recording") from error
-    numbers = frame_numbers(inputs.run.frame_ids)
+    numbers, first = frame_numbers(inputs.run.frame_ids), RunFrame(inputs, inputs.run.frame_ids[0])
+    stream = rr.RecordingStream("directshape", send_properties=False)
     with replaced_file(path) as file:
-        stream = _Stream(rerun, file.name)
         try:
+            # The viewer's views are fitted to the image size of the first frame.
+            height, width = first.with_images.frame.sizes[0].tolist()
+            stream.save(file.name, default_blueprint=_blueprint((width, height)))
+            # The time of logging does not belong to the refinement.
+            stream.set_log_time_enabled(False)
+            stream.set_log_tick_enabled(False)
+            _log_conventions(stream)
             yield lambda frame: _add(stream, frame, numbers[frame.frame_id])
         finally:
-            stream.close()
+            stream.flush()
+            stream.disconnect()
 
 
-def _add(stream: _Stream, frame: RunFrame, number: int) -> None:
+def _add(stream: RecordingStream, frame: RunFrame, number: int) -> None:
     """Log everything of a frame at its number on the timeline."""
+    import rerun as rr
+
     loaded = frame.with_images
-    if not stream.has_begun:
-        # The viewer's views are fitted to the image size of the first frame.
-        height, width = loaded.frame.sizes[0].tolist()
-        stream.begin((width, height))
-        _log_conventions(stream)
-    stream.at(number)
+    stream.set_time(_TIMELINE, sequence=number)
     _log_images(stream, loaded)
     _log_boxes(stream, frame)
     ground = ground_grid(loaded.frame.ground.normal[0], float(loaded.frame.ground.offset[0]))
-    stream.log_mesh("world/ground", ground, GREY)
+    stream.log("world/ground", _mesh(ground, albedo_factor=[*GREY, 255]), strict=True)
     # The cars of other frames are not shown.
-    stream.log("world/cars", stream.rr.Clear(recursive=True))
+    stream.log("world/cars", rr.Clear(recursive=True), strict=True)
     for index, row in enumerate(frame.refined):
         # All frames of a track use one name.
         track = frame.result.shapes.tracks[row]
         surface, paint = frame.painted.mesh(index)
-        stream.log_mesh(f"world/cars/{f'track_{track}' if track else frame.after[row].line}", surface, paint.rgb)
+        name = f"track_{track}" if track else frame.after[row].line
+        stream.log(f"world/cars/{name}", _mesh(surface, vertex_colors=paint.rgb), strict=True)
 
 
 def frame_numbers(frame_ids: Sequence[str]) -> dict[str, int]:
@@ -86,109 +92,78 @@ def frame_numbers(frame_ids: Sequence[str]) -> dict[str, int]:
     return {one: number for number, one in enumerate(frame_ids, start=1)}
 
 
-def _log_conventions(stream: _Stream) -> None:
+def _log_conventions(stream: RecordingStream) -> None:
     """Log the left camera frame as world (x right, y down, z forward, metres), and line numbers as mask classes."""
-    stream.log("world", stream.rr.ViewCoordinates.RDF, static=True)
+    import rerun as rr
+
+    stream.log("world", rr.ViewCoordinates.RDF, static=True, strict=True)
     # The viewer gives each number its own colour.
     classes: list[Any] = [(0, "no car", (0, 0, 0, 0))]
     classes += [(number, f"car {number}") for number in range(1, _MOST_LINES + 1)]
     for entity in (_LEFT, _RIGHT):
-        stream.log(f"{entity}/masks", stream.rr.AnnotationContext(classes), static=True)
+        stream.log(f"{entity}/masks", rr.AnnotationContext(classes), static=True, strict=True)
 
 
-def _log_images(stream: _Stream, loaded: LoadedFrame) -> None:
+def _log_images(stream: RecordingStream, loaded: LoadedFrame) -> None:
     """Log both images with the camera, and masks whose values are line numbers of the cars, 0 for none."""
-    rr, frame, detections = stream.rr, loaded.frame, loaded.detections
+    import rerun as rr
+
+    frame, detections = loaded.frame, loaded.detections
     height, width = frame.sizes[0].tolist()
     K_image = frame.camera.K_left[0].double().cpu().numpy().copy()
     # Pixels of Rerun have their corners at whole numbers, ours their centres.
     K_image[:2, 2] += 0.5
-    axes = rr.ViewCoordinates.RDF
-    stream.log("world/cam", rr.Pinhole(image_from_camera=K_image, resolution=[width, height], camera_xyz=axes))
+    camera = rr.Pinhole(image_from_camera=K_image, resolution=[width, height], camera_xyz=rr.ViewCoordinates.RDF)
+    stream.log("world/cam", camera, strict=True)
     sides = ((_LEFT, frame.images_left, detections.mask_left), (_RIGHT, frame.images_right, detections.mask_right))
     for entity, images, masks in sides:
-        stream.log(entity, rr.Image(rgb8(images[0])).compress(jpeg_quality=_JPEG_QUALITY))
+        stream.log(entity, rr.Image(rgb8(images[0])).compress(jpeg_quality=_JPEG_QUALITY), strict=True)
         numbers = np.zeros(masks.size_hw, dtype=np.uint16)
         for mask, detected in zip(masks, loaded.detected_objects, strict=True):
             numbers[(mask > MASK_THRESHOLD).cpu().numpy()] = detected.line_number
-        stream.log(f"{entity}/masks", rr.SegmentationImage(numbers, opacity=_MASK_OPACITY))
+        stream.log(f"{entity}/masks", rr.SegmentationImage(numbers, opacity=_MASK_OPACITY), strict=True)
 
 
-def _log_boxes(stream: _Stream, frame: RunFrame) -> None:
+def _log_boxes(stream: RecordingStream, frame: RunFrame) -> None:
     """Log the boxes of the input, of the truth, and of the result, with grey for cars that were not refined."""
     for name, cars in (("before", frame.before or []), ("after", frame.after)):
-        corners, colours = np.array([car.corners_cam for car in cars]), [car.colour for car in cars]
+        corners, colours = [car.corners_cam for car in cars], [car.colour for car in cars]
         labels = [f"{car.line} {car.status or ''}".rstrip() for car in cars]
-        stream.log_boxes(f"world/boxes/{name}", corners, colours, labels)
-    truth = np.array(frame.truth_corners_cam)
-    stream.log_boxes("world/boxes/truth", truth, [GREEN] * len(truth), ["truth"] * len(truth))
+        stream.log(f"world/boxes/{name}", _boxes(corners, colours, labels), strict=True)
+    truth = frame.truth_corners_cam
+    stream.log("world/boxes/truth", _boxes(truth, [GREEN] * len(truth), ["truth"] * len(truth)), strict=True)
 
 
-class _Stream:
-    """A `_Stream` writes what is logged to a file, from its beginning on."""
+def _boxes(corners_cam: Sequence[Array], colours: Sequence[Colour], labels: Sequence[str]) -> Any:
+    """Boxes from their corners (8, 3) in the order of `box_corners`, with length, height, width along their axes."""
+    import rerun as rr
+    from scipy.spatial.transform import Rotation
 
-    def __init__(self, rerun: Any, path: str) -> None:
-        self.rr, self._path, self.has_begun = rerun, path, False
-        self._stream = rerun.RecordingStream("directshape", send_properties=False)
+    corners = np.array(corners_cam, dtype=np.float64).reshape(-1, 8, 3)
+    axes = corners[:, :1] - corners[:, [3, 4, 1]]
+    sizes = np.linalg.norm(axes, axis=2)
+    # Axes are rows here, so the matrix is that of the inverse rotation.
+    inverse = Rotation.from_matrix(axes / sizes[:, :, None]) if len(axes) else None
+    return rr.Boxes3D(
+        centers=corners.mean(axis=1),
+        half_sizes=0.5 * sizes,
+        quaternions=[] if inverse is None else [rr.Quaternion(xyzw=q) for q in inverse.inv().as_quat()],
+        colors=np.array(colours, dtype=np.uint8).reshape(-1, 3),
+        labels=list(labels),
+        show_labels=False,
+        fill_mode=rr.components.FillMode.MajorWireframe,
+    )
 
-    def begin(self, size_wh: tuple[int, int]) -> None:
-        """Open the file with a layout for images of this size."""
-        self._stream.save(self._path, default_blueprint=_blueprint(size_wh))
-        # The time of logging does not belong to the refinement.
-        self._stream.set_log_time_enabled(False)
-        self._stream.set_log_tick_enabled(False)
-        self.has_begun = True
 
-    def at(self, frame: int) -> None:
-        """Set the place on the timeline for what is logged next."""
-        self._stream.set_time(_TIMELINE, sequence=frame)
+def _mesh(mesh: trimesh.Trimesh, **colours: Any) -> Any:
+    import rerun as rr
 
-    def log(self, entity: str, *archetypes: Any, static: bool = False) -> None:
-        """Log at the current place, or for all times if `static`; values that Rerun does not accept raise."""
-        self._stream.log(entity, *archetypes, static=static, strict=True)
-
-    def log_mesh(self, entity: str, mesh: trimesh.Trimesh, colours: NDArray[np.uint8] | Colour) -> None:
-        """Log triangles with a colour for each vertex, or one colour for all."""
-        of_all = isinstance(colours, tuple)
-        made = self.rr.Mesh3D(
-            vertex_positions=np.asarray(mesh.vertices, dtype=np.float32),
-            triangle_indices=np.asarray(mesh.faces, dtype=np.uint32),
-            vertex_normals=np.asarray(mesh.vertex_normals, dtype=np.float32),
-            vertex_colors=None if of_all else colours,
-            albedo_factor=[*colours, 255] if of_all else None,
-        )
-        self.log(entity, made)
-
-    def log_boxes(
-        self,
-        entity: str,
-        corners_cam: NDArray[np.floating[Any]],  # (B, 8, 3) in the order of `box_corners`
-        colours: Sequence[Colour],
-        labels: Sequence[str],
-    ) -> None:
-        """Log boxes with length, height, width along the axes of their objects."""
-        from scipy.spatial.transform import Rotation
-
-        corners = corners_cam.astype(np.float64).reshape(-1, 8, 3)
-        axes = corners[:, :1] - corners[:, [3, 4, 1]]
-        sizes = np.linalg.norm(axes, axis=2)
-        # Axes are rows here, so the matrix is that of the inverse rotation.
-        inverse = Rotation.from_matrix(axes / sizes[:, :, None]) if len(axes) else None
-        boxes = self.rr.Boxes3D(
-            centers=corners.mean(axis=1),
-            half_sizes=0.5 * sizes,
-            quaternions=[] if inverse is None else [self.rr.Quaternion(xyzw=q) for q in inverse.inv().as_quat()],
-            colors=np.array(colours, dtype=np.uint8).reshape(-1, 3),
-            labels=list(labels),
-            show_labels=False,
-            fill_mode=self.rr.components.FillMode.MajorWireframe,
-        )
-        self.log(entity, boxes)
-
-    def close(self) -> None:
-        """Write the end of the file."""
-        self._stream.flush()
-        self._stream.disconnect()
+    return rr.Mesh3D(
+        vertex_positions=np.asarray(mesh.vertices, dtype=np.float32),
+        triangle_indices=np.asarray(mesh.faces, dtype=np.uint32),
+        vertex_normals=np.asarray(mesh.vertex_normals, dtype=np.float32),
+        **colours,
+    )
 
 
 def _blueprint(size_wh: tuple[int, int]) -> Any:

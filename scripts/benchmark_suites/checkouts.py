@@ -7,7 +7,8 @@ refiner.
     PYTHONPATH=CHECKOUT:scripts python -m benchmark_suites.checkouts
 
 This command runs one such process. It prints its scenes and then answers each line `SCENE FIRST COUNT`, a call of COUNT
-frames, with the seconds of the call, or with its operations if the line ends in `operations`.
+frames, with the seconds of the call. If the line ends in `operations`, it answers with their number, and if it ends in
+`masks`, with the seconds of a call that makes its boxes of the masks.
 """
 
 from __future__ import annotations
@@ -26,10 +27,9 @@ from typing import Any
 
 import torch
 
-from benchmark_suites.measures import count_operations
-from benchmark_suites.timing import Row, Spread
+from benchmark_suites.measures import Row, Spread, count_operations
 from benchmark_suites.workloads import load_scenes
-from directshape_torch import DirectShapeRefiner
+from directshape_torch import Detections, DirectShapeRefiner, FrameBatch
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.io.frame_collation import collate
 
@@ -57,19 +57,23 @@ def against_rows(checkout: Path, data_root: Path | None, quick: bool = False) ->
                 calls[f"{scene}, {_BATCH_FRAMES} frames in a call"] = [(0, _BATCH_FRAMES)]
             for what, frames in calls.items():
                 asked = [f"{number} {first} {size}" for first, size in frames]
-                seconds = [pair for line in asked for pair in _seconds(ours, theirs, line, rounds)]
-                note = " over ".join(f"{1e3 * median(side):.0f} ms" for side in zip(*seconds, strict=True))
-                yield Row(f"{what}, time", Spread.of([a / b for a, b in seconds]), note)
+                for words, ending in (("time", ""), ("time from masks alone over given boxes", " masks")):
+                    seconds = [pair for line in asked for pair in _seconds(ours, theirs, line, ending, rounds)]
+                    note = " over ".join(f"{1e3 * median(side):.0f} ms" for side in zip(*seconds, strict=True))
+                    yield Row(f"{what}, {words}", Spread.of([a / b for a, b in seconds]), note)
                 found = [[version.ask(f"{line} operations") for line in asked] for version in (ours, theirs)]
                 note = f"{' '.join(map(str, found[0]))} over {' '.join(map(str, found[1]))}"
                 yield Row(f"{what}, operations", Spread.of([a / b for a, b in zip(*found, strict=True)]), note)
 
 
-def _seconds(ours: _Version, theirs: _Version, line: str, rounds: int) -> Iterator[tuple[float, float]]:
-    """Times of calls in turn, ours and theirs, with alternating order, after a first call that is not measured."""
+def _seconds(ours: _Version, theirs: _Version, line: str, ending: str, rounds: int) -> Iterator[tuple[float, float]]:
+    """Times of calls in turn, with alternating order, after a first call that is not measured.
+
+    This version is asked a line with an ending, and the other version the line alone.
+    """
     for number in range(rounds + 1):
-        order = (ours, theirs) if number % 2 else (theirs, ours)
-        seconds = {version: version.ask(line) for version in order}
+        order = ((ours, ending), (theirs, "")) if number % 2 else ((theirs, ""), (ours, ending))
+        seconds = {version: version.ask(line + end) for version, end in order}
         if number:
             yield seconds[ours], seconds[theirs]
 
@@ -108,6 +112,12 @@ def _version(root: Path, data_root: Path | None) -> Iterator[_Version]:
         yield _Version(process)
 
 
+def _from_masks(frames: FrameBatch, given: Detections) -> tuple[FrameBatch, Detections]:
+    """The inputs of a call without given boxes."""
+    masks = given.mask_left, given.mask_right
+    return frames, Detections.from_masks(frames, *masks, frame_index=given.frame_index)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one version: answer lines until there are no more."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -119,14 +129,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     refiner = DirectShapeRefiner()
     print(json.dumps([(scene.name, len(scene.frames)) for scene in scenes]), flush=True)
     for line in sys.stdin:
-        number, first, count, *operations = line.split()
+        number, first, count, *ending = line.split()
         frames = scenes[int(number)].frames
         inputs = collate([frames[n % len(frames)] for n in range(int(first), int(first) + int(count))])
-        if operations:
+        if ending == ["operations"]:
             print(count_operations(lambda: refiner(*inputs)), flush=True)  # noqa: B023
             continue
         start = time.process_time()
-        refiner(*inputs)
+        refiner(*(_from_masks(*inputs) if ending else inputs))
         print(time.process_time() - start, flush=True)
 
 

@@ -12,7 +12,7 @@ from statistics import median
 
 import torch
 
-from benchmark_suites.timing import Row, Spread
+from benchmark_suites.measures import Row, Spread
 from benchmark_suites.workloads import load_scenes
 from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, RefinementResult, load_config
 from directshape_torch.io.frame_collation import collate

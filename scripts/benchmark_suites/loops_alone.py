@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmark_suites.timing import Row, Spread, time_interleaved
+from benchmark_suites.measures import Row, Spread, time_interleaved
 from directshape_torch import Detections, DirectShapeRefiner, FrameBatch
 from directshape_torch.errors import MissingDependencyError
 from directshape_torch.kernels.arguments import Rays

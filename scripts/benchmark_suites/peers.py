@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from benchmark_suites.loops_alone import loops_row
-from benchmark_suites.timing import Row, Spread, time_interleaved
+from benchmark_suites.measures import Row, Spread, time_interleaved
 from benchmark_suites.workloads import load_scenes
 from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, load_config
 from directshape_torch.errors import MissingDependencyError

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from parametric_cars import surfaces as cars
@@ -11,6 +11,9 @@ from demo_scene.camera import Array, transform
 from demo_scene.layout import PlacedCar
 from demo_scene.surfaces import Indices, Material, Surface
 
+if TYPE_CHECKING:
+    import trimesh
+
 # These parts are not in `parametric_cars`; the first are the gaps around doors, bonnet and tailgate.
 _GAP = 100
 _TAIL_LIGHT = 101
@@ -18,25 +21,9 @@ _SPOKE_GAP = 102
 _SPLITS = 2
 
 
-@dataclass(frozen=True)
-class CarModel:
-    """A `CarModel` is a car's closed mesh in its object frame: vertices (N, 3), faces (M, 3), smooth normals (N, 3)."""
-
-    vertices: Array
-    faces: Indices
-    normals: Array
-
-
-def car_model(car: PlacedCar, spacing_m: float = 0.03) -> CarModel:
-    """The mesh of a car, before it is cut into parts."""
-    mesh = cars.car_mesh(car.parameters, spacing_m)
-    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    return CarModel(vertices, faces, np.asarray(mesh.vertex_normals, np.float64))
-
-
-def car_surfaces(car: PlacedCar, model: CarModel, instance: int) -> list[Surface]:
+def car_surfaces(car: PlacedCar, mesh: trimesh.Trimesh, instance: int) -> list[Surface]:
     """One surface for each part, in the road frame; together they are the closed mesh."""
-    vertices, normals, faces, part = _cut(car, model)
+    vertices, normals, faces, part = _cut(car, mesh)
     vertices_road = transform(car.T_road_obj, vertices)
     normals_road = normals @ car.T_road_obj[:3, :3].T
     materials = _materials(car)
@@ -55,12 +42,13 @@ def car_surfaces(car: PlacedCar, model: CarModel, instance: int) -> list[Surface
     return surfaces
 
 
-def _cut(car: PlacedCar, model: CarModel) -> tuple[Array, Array, Indices, Indices]:
+def _cut(car: PlacedCar, mesh: trimesh.Trimesh) -> tuple[Array, Array, Indices, Indices]:
     """Split the triangles along part borders, so that borders are accurate to a few millimetres.
 
     The new vertices are midpoints of straight edges, so the surface is unchanged and stays closed.
     """
-    vertices, normals, faces = model.vertices, model.normals, model.faces
+    vertices, normals = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.vertex_normals, np.float64)
+    faces = np.asarray(mesh.faces, np.int64)
     for _ in range(_SPLITS):
         at_vertices = part_labels(car, vertices)[faces]
         middles = vertices[faces].mean(axis=1)

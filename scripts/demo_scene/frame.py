@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+from parametric_cars.surfaces import car_mesh
 
 from demo_scene import sensor
 from demo_scene.camera import Array, transform
-from demo_scene.car_surfaces import CarModel, car_model, car_surfaces
+from demo_scene.car_surfaces import car_surfaces
 from demo_scene.frame_files import Frame
 from demo_scene.labels import CarLabel, noisy_detection, true_label
 from demo_scene.layout import SceneLayout
@@ -17,6 +19,9 @@ from demo_scene.rendering import Light, PixelTruth, Renderer
 from demo_scene.sky import sky_radiance
 from demo_scene.street import street
 from demo_scene.surfaces import Picture, Surface
+
+if TYPE_CHECKING:
+    import trimesh
 
 _RIGHT_GAIN_DEVIATION = 0.02
 # A car gets a label if it has this many visible pixels, and all of it is this far in front of the camera.
@@ -41,14 +46,14 @@ def render_sequence(layouts: Sequence[SceneLayout], settings: RenderSettings) ->
     first = layouts[0]
     rngs = dict(zip(("street", "sky", "sensor", "detector"), _generators(first.seed, 4), strict=True))
     still, light = street(rngs["street"]), scene_light(rngs["sky"], first)
-    models = [car_model(car) for car in first.cars]
+    meshes = [car_mesh(car.parameters) for car in first.cars]
     for number, layout in enumerate(layouts):
-        car_parts = [car_surfaces(c, m, k) for k, (c, m) in enumerate(zip(layout.cars, models, strict=True))]
+        car_parts = [car_surfaces(c, m, k) for k, (c, m) in enumerate(zip(layout.cars, meshes, strict=True))]
         surfaces = still + [surface for parts in car_parts for surface in parts]
         left, right = _pictures(Renderer(surfaces, light, settings.variant), layout, number, rngs["sensor"], settings)
         truth = Renderer(surfaces, None, settings.variant)
         truth_left, truth_right = (truth.pixel_truth(view) for view in _views(layout))
-        labels = _labels(layout, models, car_parts, truth_left, settings.variant)
+        labels = _labels(layout, meshes, car_parts, truth_left, settings.variant)
         detections = {k: noisy_detection(rngs["detector"], label) for k, label in labels.items()}
         yield Frame(layout, left, right, truth_left.instance, truth_right.instance, labels, detections)
 
@@ -72,20 +77,21 @@ def _pictures(
 
 def _labels(
     layout: SceneLayout,
-    models: Sequence[CarModel],
+    meshes: Sequence[trimesh.Trimesh],
     car_parts: list[list[Surface]],
     truth: PixelTruth,
     variant: str,
 ) -> dict[int, CarLabel]:
     """Labels of the visible cars, by their number."""
     labels = {}
-    for k, (car, model) in enumerate(zip(layout.cars, models, strict=True)):
+    for k, (car, mesh) in enumerate(zip(layout.cars, meshes, strict=True)):
         pixels = int((truth.instance == k).sum())
-        depths = transform(layout.camera.T_cam_road @ car.T_road_obj, model.vertices)[:, 2]
+        vertices = np.asarray(mesh.vertices)
+        depths = transform(layout.camera.T_cam_road @ car.T_road_obj, vertices)[:, 2]
         if pixels >= _FEWEST_PIXELS and depths.min() > _NEAREST_M:
             alone = Renderer(car_parts[k], None, variant).pixel_truth(layout.camera.T_cam_road)
             share = pixels / int((alone.instance == k).sum())
-            labels[k] = true_label(layout.camera, car, model.vertices, share)
+            labels[k] = true_label(layout.camera, car, vertices, share)
     return labels
 
 

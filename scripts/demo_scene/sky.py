@@ -9,15 +9,14 @@ from demo_scene.camera import Array
 from demo_scene.noise import fractal_noise
 
 
-def sky_radiance(rng: np.random.Generator, sun_direction_up: Array, width: int = 1024) -> Array:
-    """Linear RGB radiance (width / 2, width, 3); row 0 is the zenith, the middle row the horizon.
+def sky_radiance(rng: np.random.Generator, sun_direction_up: Array) -> Array:
+    """Linear RGB radiance (512, 1024, 3); row 0 is the zenith, the middle row the horizon.
 
     Args:
         rng: source of the clouds.
         sun_direction_up: unit vector (3,) towards the sun in the map's own frame (y up).
-        width: columns of the map.
     """
-    height = width // 2
+    height, width = 512, 1024
     polar = (np.arange(height) + 0.5) / height * np.pi
     azimuth = (np.arange(width) + 0.5) / width * 2 * np.pi
     # In the renderer's convention u = 0 looks along +z and u grows towards +x, mirrored, as in `atan2(x, -z)`.

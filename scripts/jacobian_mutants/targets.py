@@ -16,7 +16,6 @@ class Target:
     tests: tuple[str, ...]
 
 
-_SE3_TESTS = ("tests/geometry/test_se3.py",)
 _LABORATORY = "tests/laboratory/test_three_ways.py"
 _MINIMUM = "tests/shape/test_ray_minimum.py::test_minimum_and_first_hit_are_the_references"
 _SUMS = (
@@ -122,13 +121,19 @@ TARGETS: dict[str, Target] = {
         ("CarStage.figures", "CarIterations.evaluated", "_Layout.of"),
         _SUMS,
     ),
-    "se3_exp": Target(
+    "se3": Target(
         "directshape_torch/geometry/se3.py",
-        ("generators", "_higher_exp_coefficients", "exp", "from_rotation_translation"),
-        _SE3_TESTS,
-    ),
-    "se3_group": Target(
-        "directshape_torch/geometry/se3.py", ("inverse", "transform", "from_kornia", "to_kornia"), _SE3_TESTS
+        (
+            "generators",
+            "_higher_exp_coefficients",
+            "exp",
+            "from_rotation_translation",
+            "inverse",
+            "transform",
+            "from_kornia",
+            "to_kornia",
+        ),
+        ("tests/geometry/test_se3.py",),
     ),
     "unknowns": Target(
         "directshape_torch/state/unknowns.py",
@@ -155,12 +160,6 @@ TARGETS: dict[str, Target] = {
             "GridShape.of",
             "GridShape.value",
             "GridShape.value_and_derivatives",
-        ),
-        ("tests/shape/test_sdf_grid.py",),
-    ),
-    "grid_lookup": Target(
-        "directshape_torch/shape/sdf_grid.py",
-        (
             "GridShape.sdf",
             "GridShape.derivatives",
             "GridShape.gradient",
@@ -168,12 +167,6 @@ TARGETS: dict[str, Target] = {
             "_interpolated",
             "_between",
             "_summed",
-        ),
-        ("tests/shape/test_sdf_grid.py",),
-    ),
-    "grid_cells": Target(
-        "directshape_torch/shape/sdf_grid.py",
-        (
             "positions",
             "steps",
             "lower_nodes",

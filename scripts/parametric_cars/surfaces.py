@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -29,18 +28,6 @@ _TABLE_MARGIN_M = 0.6
 _ARCH_GAP_M = 0.04
 # The arch is a groove around the tyre without a cavity behind the wheel, where meshes of real cars have liners.
 _ARCH_DEPTH_M = 0.08
-
-
-@dataclass(frozen=True)
-class _SideView:
-    """A `_SideView` is the tabulated signed distance to the side view's outline; x is forward from the car's middle."""
-
-    distance: Array  # (nx, nh)
-    origin: tuple[float, float]
-
-    def __call__(self, x: Array, height: Array) -> Array:
-        index = [(x - self.origin[0]) / _TABLE_SPACING_M, (height - self.origin[1]) / _TABLE_SPACING_M]
-        return np.asarray(map_coordinates(self.distance, index, order=1, mode="nearest"), dtype=np.float64)
 
 
 def side_outline(car: CarParameters) -> Array:
@@ -106,12 +93,18 @@ def polygon_distance(points: Array, polygon: Array) -> Array:
 
 
 @lru_cache(maxsize=16)
-def _side_view(car: CarParameters) -> _SideView:
+def _side_view(car: CarParameters) -> Callable[[Array, Array], Array]:
+    """The signed distance to the side view's outline, from a table, by x forward from the car's middle and height."""
     x = np.arange(-0.5 * car.length - _TABLE_MARGIN_M, 0.5 * car.length + _TABLE_MARGIN_M, _TABLE_SPACING_M)
     height = np.arange(-_TABLE_MARGIN_M, car.height + _TABLE_MARGIN_M, _TABLE_SPACING_M)
     points = np.stack(np.meshgrid(x, height, indexing="ij"), axis=-1).reshape(-1, 2)
     distance = polygon_distance(points, side_outline(car)).reshape(len(x), len(height))
-    return _SideView(distance, (float(x[0]), float(height[0])))
+
+    def looked_up(at_x: Array, at_height: Array) -> Array:
+        index = [(at_x - x[0]) / _TABLE_SPACING_M, (at_height - height[0]) / _TABLE_SPACING_M]
+        return np.asarray(map_coordinates(distance, index, order=1, mode="nearest"), dtype=np.float64)
+
+    return looked_up
 
 
 def half_width(car: CarParameters, x: Array, height: Array) -> Array:
@@ -181,11 +174,23 @@ def car_mesh(parameters: CarParameters, spacing_m: float = 0.03) -> trimesh.Trim
         InputError: the spacing is not within 5 mm to 0.2 m.
     """
     import trimesh
+    from skimage.measure import marching_cubes
 
     if not 0.005 <= spacing_m <= 0.2:
         raise InputError("spacing_m", "0.005 to 0.2", f"{spacing_m}")
-    vertices, faces = _half_symmetric_surface(parameters, spacing_m)
-    return trimesh.Trimesh(vertices, faces, process=False)
+    margin = 3 * spacing_m
+    x = np.arange(-0.5 * parameters.length - margin, 0.5 * parameters.length + margin + spacing_m, spacing_m)
+    y = np.arange(-parameters.height - margin, margin + spacing_m, spacing_m)
+    # No node plane is in the middle (half a step off), so that the mirrored halves share no degenerate triangles.
+    z_half = (np.arange(int((0.5 * parameters.width + margin) / spacing_m) + 2) + 0.5) * spacing_m
+    nodes = np.stack(np.meshgrid(x, y, z_half, indexing="ij"), axis=-1).reshape(-1, 3)
+    # The implicit function is evaluated on one half and mirrored.
+    half = implicit(parameters, nodes).reshape(len(x), len(y), len(z_half))
+    values = np.concatenate([half[:, :, ::-1], half], axis=2)
+    extract: Callable[..., tuple[Array, NDArray[np.int32], Array, Array]] = marching_cubes
+    vertices, faces, _, _ = extract(values, 0.0, spacing=(spacing_m,) * 3, gradient_direction="descent")
+    origin = np.array([x[0], y[0], -z_half[-1]])
+    return trimesh.Trimesh(vertices + origin, faces, process=False)
 
 
 def car_sdf(parameters: CarParameters, points_obj: Array) -> Array:
@@ -197,9 +202,9 @@ def car_sdf(parameters: CarParameters, points_obj: Array) -> Array:
     points = np.asarray(points_obj, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError("points_obj", "shape (N, 3)", str(points.shape))
-    tree, vertices, normals = _surface_tree(parameters)
+    tree, normals = _surface_tree(parameters)
     distance, nearest = tree.query(points)
-    offset = points - vertices[nearest]
+    offset = points - tree.data[nearest]
     along_normal = np.abs((offset * normals[nearest]).sum(axis=1))
     near = distance < 1.5 * _SURFACE_SPACING_M
     unsigned = np.where(near, along_normal, distance)
@@ -207,30 +212,11 @@ def car_sdf(parameters: CarParameters, points_obj: Array) -> Array:
 
 
 @lru_cache(maxsize=4)
-def _surface_tree(parameters: CarParameters) -> tuple[cKDTree, Array, Array]:
+def _surface_tree(parameters: CarParameters) -> tuple[cKDTree, Array]:
     from scipy.spatial import cKDTree
 
     mesh = car_mesh(parameters, _SURFACE_SPACING_M)
-    vertices = np.asarray(mesh.vertices)
-    return cKDTree(vertices), vertices, np.asarray(mesh.vertex_normals)
-
-
-def _half_symmetric_surface(car: CarParameters, spacing_m: float) -> tuple[Array, NDArray[np.int32]]:
-    """Marching cubes of the solid; the implicit function is evaluated on one half and mirrored."""
-    from skimage.measure import marching_cubes
-
-    margin = 3 * spacing_m
-    x = np.arange(-0.5 * car.length - margin, 0.5 * car.length + margin + spacing_m, spacing_m)
-    y = np.arange(-car.height - margin, margin + spacing_m, spacing_m)
-    # No node plane is in the middle (half a step off), so that the mirrored halves share no degenerate triangles.
-    z_half = (np.arange(int((0.5 * car.width + margin) / spacing_m) + 2) + 0.5) * spacing_m
-    nodes = np.stack(np.meshgrid(x, y, z_half, indexing="ij"), axis=-1).reshape(-1, 3)
-    half = implicit(car, nodes).reshape(len(x), len(y), len(z_half))
-    values = np.concatenate([half[:, :, ::-1], half], axis=2)
-    extract: Callable[..., tuple[Array, NDArray[np.int32], Array, Array]] = marching_cubes
-    vertices, faces, _, _ = extract(values, 0.0, spacing=(spacing_m,) * 3, gradient_direction="descent")
-    origin = np.array([x[0], y[0], -z_half[-1]])
-    return vertices + origin, faces
+    return cKDTree(mesh.vertices), np.asarray(mesh.vertex_normals)
 
 
 def car_part_labels(car: CarParameters, points_obj: Array) -> NDArray[np.int64]:

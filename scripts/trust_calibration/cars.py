@@ -1,4 +1,4 @@
-"""This module refines cars with labels, boxes on images where no car is, and boxes with the masks of other cars."""
+"""This module refines cars with labels, and boxes on images where no car is."""
 
 from __future__ import annotations
 
@@ -67,7 +67,6 @@ class Cars:
     detector: str
     frames: list[Frame]
     elsewhere: list[Frame]  # boxes and masks on other images
-    swapped: list[Frame]  # each box with the mask of its neighbour in the image, which itself is not detected
     by_frame: bool  # rig and detector are what each frame tells by itself
 
     def compared(self, noise: ImageNoise, frames: list[Frame]) -> list[tuple[Frame, CarBatch, DetectorComparison]]:
@@ -142,7 +141,7 @@ def refined_cars(
     masks: Path,
     detector: str,
     overrides: Sequence[str],
-    with_wrong: bool,
+    with_elsewhere: bool,
     by_frame: bool,
 ) -> Cars:
     """All cars of a run whose rigs are estimated from its detections, with every result returned."""
@@ -160,9 +159,8 @@ def refined_cars(
             refiner.rig = RigEstimate.of_frames(each.frame)
             refiner.rig.update(each.frame, each.detections)
         frames += _with_labels(refiner, each)
-    elsewhere = _elsewhere(refiner, loaded) if with_wrong else []
-    swapped = [frame for each in loaded for frame in _swapped(refiner, each)] if with_wrong else []
-    return Cars(root.name, detector, frames, elsewhere, swapped, by_frame)
+    elsewhere = _elsewhere(refiner, loaded) if with_elsewhere else []
+    return Cars(root.name, detector, frames, elsewhere, by_frame)
 
 
 def _with_labels(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> list[Frame]:
@@ -192,26 +190,6 @@ def _elsewhere(refiner: DirectShapeRefiner, loaded: Sequence[LoadedFrame]) -> li
         rows = [row for row in range(len(result)) if is_free[row] and result.refined[row]]
         if rows:
             frames.append(_frame(_corrected(refiner, other), result, each.detections, rows, None))
-    return frames
-
-
-def _swapped(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> list[Frame]:
-    """Each labelled car by itself with the masks of its neighbour in the image, as if that were not detected."""
-    found = match_to_labels(loaded.detected_objects, loaded.labels or [])
-    centre = np.array([(o.box_2d[0] + o.box_2d[2], o.box_2d[1] + o.box_2d[3]) for o in loaded.detected_objects])
-    frames = []
-    for row, label in found.items():
-        if not is_counted(label) or len(centre) < 2:
-            continue
-        distance = np.linalg.norm(centre - centre[row], axis=1)
-        distance[row] = np.inf
-        own, neighbour = torch.tensor([row]), torch.tensor([int(distance.argmin())])
-        masks = {side: getattr(loaded.detections, side).rows(neighbour) for side in ("mask_left", "mask_right")}
-        one = replace(loaded.detections.rows(own), **masks)
-        with torch.no_grad():
-            result = refiner(loaded.frame, one)
-        boxes = boxes_of([loaded.detected_objects[row]]), boxes_of([label])
-        frames += [_frame(_corrected(refiner, loaded), result, one, [0], boxes)] if result.refined[0] else []
     return frames
 
 

@@ -11,6 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
+from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -23,8 +24,8 @@ from helpers.quick_runs import result_files
 
 import directshape_torch
 from directshape_torch.batch.options import RefineOptions
-from directshape_torch.batch.ray_engine import check_cluster
-from directshape_torch.errors import InputError
+from directshape_torch.batch.ray_engine import RayEngine, check_cluster
+from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.io.run_folder import done_frames
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="ends processes as Linux does")
@@ -206,3 +207,16 @@ def test_a_graphics_card_is_none_of_ray() -> None:
 def test_workers_are_those_of_the_nodes() -> None:
     with pytest.raises(InputError, match="workers: expected none with ray"):
         RefineOptions(workers=2, ray="127.0.0.1:6379")
+
+
+def test_only_the_death_of_a_process_is_tried_again(tmp_path: Path) -> None:
+    import ray
+
+    engine = object.__new__(RayEngine)
+    engine._ray, engine._mark = ray, tmp_path / "mark"
+    died, broken = Future(), Future()  # type: ignore[var-annotated]
+    died.set_exception(ray.exceptions.WorkerCrashedError())
+    broken.set_exception(ray.exceptions.RaySystemError("no room"))
+    assert engine.report(died) is None
+    with pytest.raises(DirectShapeError, match="the cluster failed: System error: no room"):
+        engine.report(broken)

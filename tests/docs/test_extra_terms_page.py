@@ -7,18 +7,10 @@ import re
 from pathlib import Path
 
 from directshape_torch.terms.lidar import LidarPoints
-from directshape_torch.terms.term import Term
 
 ROOT = Path(__file__).parents[2]
 TERMS = (ROOT / "docs" / "extra_terms.md").read_text(encoding="utf-8")
 WALK = (ROOT / "docs" / "how_it_works.md").read_text(encoding="utf-8")
-
-
-def test_the_table_has_every_member_of_the_protocol() -> None:
-    table = TERMS[TERMS.index("| member | is |") : TERMS.index("## What a term may not do")]
-    first_column = " ".join(line.split("|")[1] for line in table.splitlines() if line.startswith("| `"))
-    named = {re.split(r"\W", name)[0] for name in re.findall(r"`([^`]+)`", first_column)}
-    assert named == {name for name in vars(Term) if not name.startswith("_")}
 
 
 def test_the_settings_of_lidar_are_those_of_the_code() -> None:

@@ -46,7 +46,7 @@ def test_the_smallest_frame_is_one(tmp_path: Path) -> None:
 
 
 def test_every_finding_is_in_the_table() -> None:
-    documented = first_column(CHECKS.split("## Findings")[1].split("## What is said")[0])
+    documented = first_column(CHECKS.split("## Findings")[1].split("## What it")[0])
     assert set(MISTAKES) | set(words_of_files(Path("calib.txt")).says) == documented
     camera, lidar = (len(all_conventions(box_form(name))) - 1 for name in ("kitti", "openpcdet"))
     assert f"in {camera} other ways (from a LiDAR's frame {lidar})" in CHECKS

@@ -1,4 +1,4 @@
-"""The names in docs/outputs.md and docs/exports.md are those of the code, and their Python runs."""
+"""The names in docs/outputs.md are those of the code, and its Python for other programs runs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from directshape_torch.visualize.refinement_trace import RefinementTrace
 
 DOCS = Path(__file__).parents[2] / "docs"
 TEXT = (DOCS / "outputs.md").read_text(encoding="utf-8")
-EXPORTS = (DOCS / "exports.md").read_text(encoding="utf-8")
+EXPORTS = TEXT[TEXT.index("## For other programs") :]
 
 
 def test_pictures_are_small() -> None:

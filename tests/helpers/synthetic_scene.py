@@ -15,7 +15,6 @@ from directshape_torch.geometry.ground_plane import GroundPlane
 from directshape_torch.geometry.projection import project, rays_from_pixels, right_rays
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.geometry.stereo_depth import disparity_of_depth
-from directshape_torch.laboratory.scenes import select_detections
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -152,7 +151,7 @@ def masked(detections: Detections, left: Tensor | None = None, right: Tensor | N
 
 def select(detections: Detections, rows: Tensor) -> Detections:
     """The detections of the given rows, in their order."""
-    return select_detections(detections, rows)
+    return detections.rows(rows)
 
 
 def joined_frames(parts: list[FrameBatch]) -> FrameBatch:

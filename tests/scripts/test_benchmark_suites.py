@@ -9,13 +9,9 @@ from pathlib import Path
 import benchmark
 import pytest
 import torch
-from benchmark_suites import checkouts, in_turn, stage_profile, workloads
-from benchmark_suites.measures import count_operations, peak_tensor_bytes
-from benchmark_suites.stage_profile import PARTS, profile_parts
-from benchmark_suites.timing import Row, Spread, time_interleaved
+from benchmark_suites import checkouts, in_turn, workloads
+from benchmark_suites.measures import Row, Spread, count_operations, peak_tensor_bytes, time_interleaved
 from helpers.car_counts import first_cars
-
-from directshape_torch.kernels.choice import without_kernels
 
 
 class FakeClock:
@@ -81,7 +77,6 @@ def one_car(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = replace(scene, frames=(first_cars(scene.frames[0], 1),))
     for module in (benchmark, in_turn):
         monkeypatch.setattr(module, "load_scenes", lambda *_: (scene,))
-    monkeypatch.setattr(stage_profile, "demo_scene", lambda: scene)
 
 
 @pytest.mark.usefixtures("one_car")
@@ -106,44 +101,6 @@ def test_times_are_told(capsys: pytest.CaptureFixture[str]) -> None:
 def test_wrong_use_is_told(arguments: list[str], named: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert benchmark.main(arguments) == 2
     assert named in capsys.readouterr().err
-
-
-# --- the profile
-
-
-def test_time_belongs_to_the_innermost_function_that_has_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = FakeClock()
-
-    def helper() -> None:
-        clock.takes(2)()
-
-    def inner() -> None:
-        clock.takes(1)()
-        helper()
-
-    def outer() -> None:
-        clock.takes(4)()
-        inner()
-        clock.takes(8)()
-
-    monkeypatch.setattr(stage_profile, "PARTS", {"inner": (inner,), "outer": (outer,)})
-    # The helper's two seconds are its caller's; the time after the call counts as that before it.
-    assert profile_parts(outer, clock) == {"inner": 3, "outer": 12, "everything else": 0}
-    monkeypatch.setattr(stage_profile, "PARTS", {"inner": (inner,), stage_profile._RESULT: (outer,)})
-    assert profile_parts(outer, clock)[stage_profile._RESULT] == 15
-
-
-@pytest.mark.usefixtures("one_car")
-def test_no_part_of_a_refinement_is_empty_and_they_add_up() -> None:
-    # What a native loop does is no operation of tensors.
-    with without_kernels():
-        *parts, whole = stage_profile.profile_rows(1)
-    assert len(parts) == len(PARTS) + 1
-    assert sum(row.spread.median for row in parts) == pytest.approx(whole.spread.median)
-    operations = [int(row.note.split()[2]) for row in parts]
-    assert min(operations) > 0
-    assert f"{sum(operations)} operations" == whole.note
-    assert operations[-1] < 0.1 * sum(operations)
 
 
 # --- other versions

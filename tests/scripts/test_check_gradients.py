@@ -1,4 +1,4 @@
-"""These tests check the exit codes, files and messages of the command, and that it reports a wrong Jacobian."""
+"""These tests check the exit codes, tables and messages of the command, and that it reports a wrong Jacobian."""
 
 from __future__ import annotations
 
@@ -23,18 +23,13 @@ def _small_prior(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(PCAShapePrior, "load_bundled", lambda: small)
 
 
-def test_tables_and_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert script.main([*_QUICK, "--term", "shape", "height", "--out", str(tmp_path)]) == 0
+def test_tables(capsys: pytest.CaptureFixture[str]) -> None:
+    assert script.main([*_QUICK, "--term", "shape", "height"]) == 0
     printed = capsys.readouterr().out
     assert "far_80m" in printed
     assert "| subject | compared | excluded |" in printed
     assert re.search(r"\| shape \| \d+ \| 0 \(0\.00 %\) \|", printed)
     assert "**All bounds hold.**" in printed
-    assert {p.name for p in tmp_path.iterdir()} == {"summary.md", "jacobians.csv"}
-    assert (tmp_path / "summary.md").read_text() == printed
-    header, *lines = (tmp_path / "jacobians.csv").read_text().splitlines()
-    assert header.startswith("subject,regime,entries,compared")
-    assert len(lines) == 4
 
 
 def test_a_wrong_jacobian_makes_the_exit_code_one(
@@ -109,7 +104,6 @@ def test_a_term_of_ones_own_with_values_of_each_car(
     (["--regime", "mars"], "regime: expected one of typical, .*got 'mars'"),
     (["--regime", "code_zero", "--term", "path"], "regime: expected one that has path, got code_zero.*track"),
     (["--states", "0"], "--states: expected at least 1"),
-    (["--data", "nowhere"], "nowhere/detections: holds no folder"),
 ])  # fmt: skip
 def test_wrong_use(capsys: pytest.CaptureFixture[str], option: list[str], message: str) -> None:
     assert script.main(option) == 2

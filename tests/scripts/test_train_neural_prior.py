@@ -58,13 +58,13 @@ def test_training_lowers_the_error_and_repeats_to_the_byte(tmp_path: Path, monke
     files = [tmp_path / "first.safetensors", tmp_path / "second.safetensors"]
     for file in files:
         words = ["--num-cars", "4", "--num-codes", "2", "--layer-widths", "12", "12", "--steps", "200"]
-        monkeypatch.setattr(sys, "argv", ["train", *words, "--cars", str(tmp_path / "cars.npz"), "--out", str(file)])
+        monkeypatch.setattr(sys, "argv", ["train", *words, "--out", str(file)])
         script.main()
     assert files[0].read_bytes() == files[1].read_bytes()
     prior = NeuralShapePrior.load(files[0])
     assert prior.provenance.num_samples == 4
     assert "seed 0, 200 steps" in prior.provenance.remarks
-    cars = script.make_cars(4, tmp_path / "cars.npz")
+    cars = script.make_cars(4)
     error = (
         prior.bind(prior.initial_code(1)).value(cars.points[0], torch.zeros(400, dtype=torch.long)) - cars.sdf[0]
     ).abs()

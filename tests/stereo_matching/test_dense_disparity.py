@@ -52,17 +52,45 @@ def test_only_frames_that_are_needed_are_matched() -> None:
 
 def test_a_part_is_matched_with_its_surroundings_and_what_lies_below_it() -> None:
     frames = cached_street()[1].frames
-    extents = torch.tensor([[90, 40, 110, 50], [5, 5, 5, 20]])  # The second part is empty.
+    extents = torch.tensor([[88, 52, 111, 71], [5, 5, 5, 20]])  # The first is that of a car, the second is empty.
     whole, part = with_disparity(frames).disparity, with_disparity(frames, torch.tensor([0, 0]), extents).disparity
     assert whole is not None
     assert part is not None
     matched = part[0].isfinite()
     (rows, columns) = (matched.any(dim=dim).nonzero()[:, 0] for dim in (1, 0))
-    assert int(rows[0]) >= 0
-    assert int(columns[0]) >= 90 - 48
-    assert int(columns[-1]) < 110 + 48
-    # Next to the part nearly all disparities are those of the whole images.
-    near = (slice(30, 70), slice(80, 120))
+    assert int(rows[0]) >= 52 - 16
+    assert int(rows[-1]) < 90 + 16
+    assert int(columns[0]) >= 88 - 16
+    assert int(columns[-1]) < 111 + 16
+    # In the part, and next to it, nearly all disparities are those of the whole images.
+    near = (slice(36, 106), slice(72, 127))
     same = torch.isclose(part[0][near], whole[0][near], atol=0.25, rtol=0, equal_nan=True)
     assert same.double().mean() > 0.97
     assert not with_disparity(frames, torch.tensor([0]), extents[1:]).disparity.isfinite().any()  # type: ignore[union-attr]
+
+
+def test_what_is_nearer_than_a_car_of_the_height_of_a_part_is_left_out() -> None:
+    frames = cached_street()[1].frames
+    near = torch.full_like(frames.images_left, 0.5)
+    torch.manual_seed(0)
+    near[0, :, 30:110] = torch.rand(80, 160, dtype=near.dtype)  # The same texture in both images, 80 px apart.
+    right = near.roll(-80, dims=-1)
+    found = with_disparity(
+        replace(frames, images_left=near, images_right=right),
+        torch.tensor([0, 0]),
+        torch.tensor([[120, 40, 150, 50]] * 2),
+    ).disparity
+    assert found is not None
+    assert not (found > 48).any()
+
+
+def test_parts_are_matched_together_where_that_is_less_work() -> None:
+    frames = cached_street()[1].frames
+    beside, apart = (
+        torch.tensor([[60, 50, 75, 70], [75, 50, 90, 70]]),
+        torch.tensor([[20, 10, 30, 20], [120, 90, 130, 100]]),
+    )
+    for extents in (beside, apart):
+        together = with_disparity(frames, torch.tensor([0, 0]), extents).disparity
+        reversed_order = with_disparity(frames, torch.tensor([0, 0]), extents.flip(0)).disparity
+        torch.testing.assert_close(together, reversed_order, rtol=0, atol=0, equal_nan=True)
