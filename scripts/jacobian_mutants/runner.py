@@ -107,7 +107,8 @@ def _collect_and_fork(job: Job) -> list[Outcome]:
     os.chdir(job.root)
     plugin = ForkedTests(job)
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-        options = ["-q", f"--rootdir={job.root}", "-W", "ignore::pytest.PytestAssertRewriteWarning"]
+        # Mutants are run on the whole of each sweep, of which the suite has a short form.
+        options = ["-q", "-m", "", f"--rootdir={job.root}", "-W", "ignore::pytest.PytestAssertRewriteWarning"]
         options += [option for name in ("cacheprovider", "xdist") for option in ("-p", f"no:{name}")]
         pytest.main([*options, *job.tests], plugins=[plugin])
     if plugin.trouble:

@@ -1,24 +1,26 @@
-"""In settings, unknown keys name the nearest one, and wrong kinds and values out of range name the key."""
+"""Mistakes in settings name the key and the nearest one, and the configuration files say what the code does."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import runpy
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
+import directshape_torch
 from directshape_torch.config import (
     BackwardConfig,
-    PriorConfig,
     RefinerConfig,
     SamplingConfig,
     Settings,
     StageConfig,
 )
 from directshape_torch.errors import ConfigError, DirectShapeError
-from directshape_torch.io.config_files import config_from_mapping, config_to_mapping, load_config
+from directshape_torch.io.config_files import BUNDLED_CONFIGS, config_from_mapping, config_to_mapping, load_config
 
 
 @pytest.mark.parametrize(
@@ -99,21 +101,11 @@ def test_a_value_out_of_range_is_named(override: str, text: str) -> None:
     assert text in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("make", "text"),
-    [
-        (lambda: RefinerConfig(compile=True), "compile: expected one of on, off, got True"),  # type: ignore[arg-type]
-        (lambda: SamplingConfig(density="5 %"), "density: expected a finite number, above 0 and at most 1, got '5 %'"),  # type: ignore[arg-type]
-        (
-            lambda: dataclasses.replace(PriorConfig(), dimensions_sigma_m=(0.1, 0.0, 0.4)),
-            "dimensions_sigma_m: expected a finite number, above 0, got (0.1, 0.0, 0.4)",
-        ),
-    ],
-)
-def test_groups_made_in_python_are_checked_too(make: Callable[[], object], text: str) -> None:
-    with pytest.raises(ConfigError) as error:
-        make()
-    assert str(error.value) == text
+def test_groups_made_in_python_are_checked_too() -> None:
+    with pytest.raises(ConfigError, match=r"^compile: expected one of on, off, got True$"):
+        RefinerConfig(compile=True)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=r"^density: expected a finite number, above 0 and at most 1, got '5 %'$"):
+        SamplingConfig(density="5 %")  # type: ignore[arg-type]
 
 
 def test_every_setting_is_described_and_every_number_has_limits() -> None:
@@ -178,9 +170,6 @@ def test_unreadable_files_and_overrides(tmp_path: Path, content: str, overrides:
     with pytest.raises(ConfigError) as error:
         load_config(path, overrides)
     assert text in str(error.value)
-
-
-def test_a_missing_file_is_an_error_of_this_package(tmp_path: Path) -> None:
     with pytest.raises(DirectShapeError, match=r"none\.yaml: cannot be read"):
         load_config(tmp_path / "none.yaml")
 
@@ -199,3 +188,65 @@ def test_errors_name_file_and_overrides(tmp_path: Path) -> None:
     )
     with pytest.raises(ConfigError, match=r"^refiner\.solver\.max_code: expected a finite number, above 0, got 0\.0$"):
         config_from_mapping(RefinerConfig, {"solver": {"max_code": 0}}, "refiner.")
+
+
+ROOT = Path(__file__).parents[2]
+CONFIGS = ROOT / "configs"
+
+
+def keys(mapping: Any, prefix: str = "") -> set[str]:
+    if not isinstance(mapping, dict):
+        return {prefix}
+    return {key for name, value in mapping.items() for key in keys(value, f"{prefix}.{name}")}
+
+
+@pytest.mark.parametrize("name", BUNDLED_CONFIGS)
+def test_names_stand_for_the_files_of_the_package(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    in_repository = load_config(CONFIGS / f"{name}.yaml")
+    monkeypatch.chdir(tmp_path)
+    assert load_config(name) == load_config(Path(name)) == in_repository
+    (tmp_path / name).write_text("solver: {max_code: 1.5}")
+    assert load_config(f"./{name}").solver.max_code == 1.5
+
+
+def test_every_file_has_a_name_and_is_part_of_the_package() -> None:
+    folder = Path(directshape_torch.__file__).parent / "assets" / "configs"
+    assert sorted(path.stem for path in folder.glob("*.yaml")) == sorted(BUNDLED_CONFIGS)
+    # One place only: the folder at the top is a link.
+    assert CONFIGS.resolve() == folder.resolve()
+    with pytest.raises(
+        ConfigError, match=r"papr: cannot be read .* bundled ones are default, paper, fast, geom.*, combined"
+    ):
+        load_config("papr")
+
+
+def test_default_is_what_its_script_writes() -> None:
+    text = runpy.run_path(str(ROOT / "scripts" / "write_default_config.py"))["default_yaml"]()
+    assert (CONFIGS / "default.yaml").read_text(encoding="utf-8") == text, "run scripts/write_default_config.py"
+
+
+@pytest.mark.parametrize("name", ["default", "paper"])
+def test_no_key_is_left_to_the_defaults(name: str) -> None:
+    written = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text(encoding="utf-8"))
+    assert keys(written) == keys(config_to_mapping(RefinerConfig()))
+
+
+def test_paper_has_the_weights_and_forms_of_the_paper() -> None:
+    config = load_config(CONFIGS / "paper.yaml")
+    # Paper, section on the energy: lambda_silh = 12, lambda_1 = 10, lambda_2 = 10, lambda_3 = 1e7.
+    assert config.silhouette.weight == 12
+    assert (config.priors.shape_weight, config.priors.height_weight, config.priors.tilt_weight) == (10, 10, 1e7)
+    assert (config.silhouette.form, config.priors.tilt_form) == ("product", "cosine")
+    assert (config.photometric.pixel_set, config.sampling.occlusion_order) == ("hit", "box_bottom")
+    assert config.solver.initial_damping == 0
+    assert config.solver.accept_every_step
+    # What the paper does not have.
+    assert config.photometric.brightness == "none"
+    assert config.priors.dimensions_weight == 0
+
+
+def test_paper_anneals_the_contour_by_a_factor_of_07() -> None:
+    widths = [stage.contour_width_px for stage in load_config(CONFIGS / "paper.yaml").stages]
+    assert widths[0] == 4 * widths[-1] == 1.0
+    for softer, sharper in pairwise(widths[:-1]):
+        assert sharper == pytest.approx(0.7 * softer, abs=1e-3)

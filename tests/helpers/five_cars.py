@@ -6,7 +6,6 @@ from dataclasses import replace
 from functools import lru_cache
 
 import torch
-from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.scene.detections import Detections
@@ -35,10 +34,3 @@ def five_cars() -> tuple[PCAShapePrior, FrameBatch, Detections]:
 def with_solver(config: RefinerConfig, **changes: object) -> RefinerConfig:
     """The settings with other values of the solver."""
     return replace(config, solver=replace(config.solver, **changes))  # type: ignore[arg-type]
-
-
-def step_of(num_cars: int, motion: float, code: float, seed: int = 7) -> Tensor:
-    """A seeded step (B, 9) with standard deviations in metres and radians, and of the code."""
-    generator = torch.Generator().manual_seed(seed)
-    scale = torch.tensor([motion] * 6 + [code] * 3, dtype=torch.float64)
-    return scale * torch.randn(num_cars, 9, generator=generator, dtype=torch.float64)

@@ -21,7 +21,6 @@ GENERAL_RIGHT = se3.exp(torch.tensor([-0.53, -0.003, 0.004, 0.004, -0.01, 0.002]
 CLOUD = PointCloudConfig(weight=30.0, huber_m=0.03, min_points=20, max_points=200)
 COMBINED = replace(DEFAULT, point_cloud=CLOUD)
 ALL_CONFIGS = {**CONFIGS, "combined": COMBINED}
-REGIMES = ("typical", "three_sigma", "near", "far", "border", "rotated_right_camera")
 
 
 @lru_cache

@@ -64,18 +64,6 @@ def test_outside_is_clamped_flagged_and_flat() -> None:
     assert gradient.tolist() == [[0.0, 4.0], [0.0, 7.0], [1.0, 0.0], [4.0, 0.0], [0.0, 0.0]]
 
 
-def test_padding_changes_nothing() -> None:
-    images = random_images(4, (2, 4, 5))
-    padded = torch.full((2, 6, 9), torch.nan, dtype=torch.float64)
-    padded[:, :4, :5] = images
-    uv = 2 * random_uv(5, (2, 40), 4, 5) - 1
-    frame_index = torch.arange(2)[:, None]
-    plain = bilinear_with_gradient(images, frame_index, uv)
-    with_padding = bilinear_with_gradient(padded, frame_index, uv, torch.tensor([[4, 5], [4, 5]]))
-    for expected, got in zip(plain, with_padding, strict=True):
-        torch.testing.assert_close(got, expected, rtol=0, atol=0)
-
-
 SIZES = [(4, 5), (1, 6), (3, 1), (1, 1), (7, 3)]
 
 

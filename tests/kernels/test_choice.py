@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import logging
 import os
 import pickle
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -121,27 +121,31 @@ def test_what_is_kept_on_the_disk_depends_on_all_sources(function: object) -> No
     assert parameter.default == jit.SOURCES
 
 
-def test_code_is_kept_where_the_folder_of_the_package_cannot_be_written(tmp_path: Path) -> None:
-    """A second process finds it. A file in the place of `__pycache__` stops the administrator, too."""
+def test_code_is_kept_where_the_folder_of_the_package_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file in the place of `__pycache__` stops the administrator, too."""
     module = tmp_path / "module"
     module.mkdir()
     (module / "__pycache__").write_text("")
     source = "from directshape_torch.kernels.jit import loop\n@loop\ndef twice(x):\n    return 2 * x\n"
     (module / "one_loop.py").write_text(source)
-    known = "from directshape_torch.kernels.jit import is_compiled; import one_loop; print(is_compiled(one_loop.twice))"
-    command = f"{known}; one_loop.twice(1.0); print(sum(one_loop.twice.stats.cache_hits.values()))"
-    path = os.pathsep.join([str(module), *sys.path])
-    environment = os.environ | {"PYTHONPATH": path, "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    environment.pop("NUMBA_CACHE_DIR", None)
-    hits = [
-        subprocess.run([sys.executable, "-c", command], env=environment, capture_output=True, text=True, check=True)
-        for _ in range(2)
-    ]
-    assert [done.stdout.split() for done in hits] == [["False", "0"], ["True", "1"]]
+    monkeypatch.syspath_prepend(module)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+
+    def imported_anew() -> tuple[bool, int]:
+        """Whether code is kept, and how often it is taken, by a module that knows nothing of earlier imports."""
+        monkeypatch.delitem(sys.modules, "one_loop", raising=False)
+        twice = importlib.import_module("one_loop").twice
+        is_kept = jit.is_compiled(twice)
+        twice(1.0)
+        return is_kept, sum(twice.stats.cache_hits.values())
+
+    assert [imported_anew(), imported_anew()] == [(False, 0), (True, 1)]
     assert list((tmp_path / "cache").rglob("*.nbc"))
     # An earlier version of the package has left a list that names a type which this version lacks.
     (kept,) = (tmp_path / "cache").rglob("*.nbi")
     kept.write_bytes(pickle.dumps(numba.__version__) + b"cdirectshape_torch.kernels.arguments\nGone\n.")
     os.utime(kept, (0, 0))
-    anew = subprocess.run([sys.executable, "-c", command], env=environment, capture_output=True, text=True, check=True)
-    assert anew.stdout.split() == ["False", "0"]
+    assert imported_anew() == (False, 0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 
 import pytest
 import torch
@@ -17,13 +16,9 @@ from directshape_torch.rows import Rays
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.terms.depth import Closest, Hits, marched_views
 
+pytestmark = pytest.mark.usefixtures("no_gradients")
+
 Call = tuple[Rays, Rays, Tensor, int, GridShape, Tensor]
-
-
-@pytest.fixture(autouse=True)
-def _no_gradients() -> Iterator[None]:
-    with torch.no_grad():
-        yield
 
 
 def call_of(bench: Bench, num_samples: int = 24) -> Call:
@@ -109,27 +104,6 @@ def test_a_call_without_right_rays_and_a_call_without_rays(typical: Bench) -> No
     assert torch.equal(natively(left_alone)[0].depth, natively(call)[0].depth[:num_left])
     closest, hits = natively((none, none, *call[2:]))
     assert closest.depth.shape == hits.depth.shape == (0, 64)
-
-
-def test_a_block_of_one_pixel() -> None:
-    call = toy_call((9, 4, 6))
-    one = tuple(side._replace(ray_cam=side.ray_cam[..., :1].contiguous()) for side in call[:2])
-    check_agreement((*one, *call[2:]))  # type: ignore[arg-type]
-
-
-def test_a_car_alone_has_the_bits_that_it_has_beside_others_and_again(typical: Bench) -> None:
-    call = call_of(typical)
-    whole = natively(call)
-    assert same_bits(natively(call), whole)
-    for car in range(3):
-        rows = [torch.nonzero(side.owner == car)[:, 0] for side in call[:2]]
-        sides = [take_rows(side, at, "M") for side, at in zip(call[:2], rows, strict=True)]
-        sides = [side._replace(owner=torch.zeros_like(side.owner)) for side in sides]
-        field = call[4]._replace(values=call[4].values[car : car + 1])
-        alone = natively((sides[0], sides[1], *call[2:4], field, call[5][car : car + 1]))
-        both = torch.cat([rows[0], rows[1] + len(call[0].owner)])
-        of_car = Closest(*(x[..., both, :] for x in whole[0])), Hits(*(x[..., rows[0], :] for x in whole[1]))
-        assert same_bits(alone, of_car)
 
 
 @pytest.mark.parametrize("what", ["pose x", "pose y", "pose z", "values", "ray"])

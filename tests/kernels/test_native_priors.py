@@ -7,14 +7,9 @@ from typing import Any
 
 import pytest
 import torch
-from benchmark_suites.workloads import demo_scene
 from helpers.single_precision import in_single
 
-from directshape_torch import DirectShapeRefiner
-from directshape_torch.io.frame_collation import collate
-from directshape_torch.kernels.choice import every_turn
 from directshape_torch.laboratory.bench import Bench
-from directshape_torch.numerics.tables import Chosen
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.terms.priors import CarPrior, with_joined_priors
@@ -58,30 +53,6 @@ def test_priors_are_those_of_tensor_operations_in_every_regime(bench: Bench, til
     for some in (terms, *([term] for term in terms[:-1])):
         natively = joined([in_single(each) for each in some])
         check_same(natively.native_part(field, single, (), fisher=False), by_tensors(joined(some), state))
-
-
-@torch.no_grad()
-def test_an_unknown_offset_of_the_rig_and_cars_whose_turn_it_is() -> None:
-    problem, state = DirectShapeRefiner().problem(*collate(demo_scene().frames))
-    assert state.offset_px.shape[1] == 1
-    state = state._replace(offset_px=state.offset_px + 0.7)
-    stage = problem.begin(0, problem.prepare(state))
-    term = with_joined_priors(stage.terms)[-1]
-    assert isinstance(term, CarPrior)
-    field, turn = field_of(problem.prior.bind(state.code)), every_turn(len(state.code))
-    expected = part_of(term, in_all_columns(term, state, term.linear(field, state, ())))
-    check_same(term.native_part(field, state, (), fisher=False), expected)
-    turn.moving[1:] = False
-    loop = term.native_loop(field, state, (), False, turn)
-    assert loop is not None
-    loop.part.cost.fill_(-1.0)
-    assert (loop.run().cost[1:] == -1).all()
-    assert float(loop.part.cost[0]) > 0
-    alone = Chosen.where(torch.arange(len(state.code)) == 0)
-    own = type(state)(*(x[:1] for x in state))
-    part = term.of(alone).native_part(field_of(problem.prior.bind(own.code)), own, (), fisher=False)
-    assert part is not None
-    assert torch.equal(part.products[0], loop.part.products[0])
 
 
 def test_another_family_of_shapes_takes_tensor_operations(typical: Bench) -> None:

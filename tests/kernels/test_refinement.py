@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
@@ -14,11 +13,7 @@ from directshape_torch.io.frame_collation import collate
 from directshape_torch.kernels.choice import without_kernels
 from directshape_torch.scene.masks import MaskCrops
 
-
-@pytest.fixture(autouse=True)
-def _no_gradients() -> Iterator[None]:
-    with torch.no_grad():
-        yield
+pytestmark = pytest.mark.usefixtures("no_gradients")
 
 
 def check_agreement(native: RefinementResult, by_tensors: RefinementResult) -> None:

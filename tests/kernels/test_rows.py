@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import pytest
@@ -15,6 +14,8 @@ from directshape_torch.numerics.tables import Chosen
 from directshape_torch.shape.field import Field, field_of
 from directshape_torch.state.unknowns import State
 from directshape_torch.terms.term import AnyTerm, Part, in_all_columns, part_of, parts_of
+
+pytestmark = pytest.mark.usefixtures("no_gradients")
 
 NAMES = ("silhouettes", "photometric")
 
@@ -35,12 +36,6 @@ class Rows(NamedTuple):
     def by_tensors(self, fisher: bool = True) -> Part[Any]:
         at = self.term.linear(self.field, self.state, self.anchor)
         return part_of(self.term, in_all_columns(self.term, self.state, at), fisher)
-
-
-@pytest.fixture(autouse=True)
-def _no_gradients() -> Iterator[None]:
-    with torch.no_grad():
-        yield
 
 
 def rows_of(bench: Bench, name: str) -> Rows:
@@ -172,16 +167,11 @@ def test_the_fisher_matrix_is_the_matrix_of_the_products_where_nobody_asks_for_i
     assert not torch.equal(with_fisher.information, without.information)
 
 
-def test_double_precision_and_other_settings_of_the_silhouette_take_tensor_operations(typical: Bench) -> None:
-    rows = rows_of(typical, "silhouettes")
-    assert rows.term.native_part(*rows[1:], fisher=True) is None
-    product = in_single(rows_of(typical, "silhouettes_product"))
-    assert product.term.native_part(*product[1:], fisher=True) is None
-
-
 @pytest.mark.parametrize("name", NAMES)
-def test_a_subclass_takes_tensor_operations(typical: Bench, name: str) -> None:
-    rows = in_single(rows_of(typical, name))
+def test_double_precision_and_a_subclass_take_tensor_operations(typical: Bench, name: str) -> None:
+    double = rows_of(typical, name)
+    assert double.term.native_part(*double[1:], fisher=True) is None
+    rows = in_single(double)
     changed = object.__new__(type("Changed", (type(rows.term),), {}))
     vars(changed).update(vars(rows.term))
     assert changed.native_part(*rows[1:], fisher=True) is None

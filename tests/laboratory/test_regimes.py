@@ -4,30 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import pytest
 import torch
 
-from directshape_torch.geometry import se3
-from directshape_torch.geometry.projection import project
 from directshape_torch.laboratory.bench import Bench, near_border
 from directshape_torch.laboratory.regimes import REGIMES
 from directshape_torch.laboratory.scenes import LaboratoryScene
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 BenchOf = Callable[..., Bench]
-
-
-@pytest.mark.parametrize(("regime", "depth_m"), [("far_80m", 80.0), ("near_3m", 3.0)])
-def test_distance(bench_of: BenchOf, regime: str, depth_m: float) -> None:
-    z = se3.inverse(bench_of(regime).state.T_obj_cam)[:, 2, 3]
-    assert ((z - depth_m).abs() < 0.3 + 0.03 * depth_m).all()
-
-
-def test_cars_are_cut_by_the_image_border(bench_of: BenchOf, scene: LaboratoryScene) -> None:
-    origin = se3.inverse(bench_of("image_border").state.T_obj_cam)[:, :3, 3]
-    u = project(origin, scene.frame.camera.K_left[0])[:, 0]
-    width = float(scene.frame.sizes[0, 1])
-    assert torch.minimum(u.abs(), (u - width).abs()).max() < 20
 
 
 def test_views_of_a_track_are_seen_in_the_next(bench_of: BenchOf) -> None:

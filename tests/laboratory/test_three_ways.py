@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -20,6 +21,12 @@ from directshape_torch.terms.term import linear_of
 BenchOf = Callable[..., Bench]
 _MORE = {"disparity_offset": ("rig",), "track": TRACK_NAMES}
 _EMPTY = "grid_border", "photometric"
+_SHORT = ("typical", "near_3m", "grazing", "identity_rotation", "grid_border", "disparity_offset", "track")
+_ALL = [pytest.param(name, marks=[] if name in _SHORT else pytest.mark.long) for name in REGIMES]
+
+
+def _long(*regimes: str) -> list[Any]:
+    return [pytest.param(name, marks=pytest.mark.long) for name in regimes]
 
 
 def _differenced(regime: str) -> tuple[str, ...]:
@@ -27,7 +34,7 @@ def _differenced(regime: str) -> tuple[str, ...]:
     return TRACK_NAMES if regime == "track" else (*TERM_NAMES, *_MORE.get(regime, ()))
 
 
-@pytest.mark.parametrize("regime", REGIMES)
+@pytest.mark.parametrize("regime", _ALL)
 def test_linear_is_the_derivative_of_residual_in_every_regime(bench_of: BenchOf, regime: str) -> None:
     """Hand-derived against autograd to 1e-9, and both ways to compute a residual give the same value."""
     bench = bench_of(regime)
@@ -43,7 +50,7 @@ def test_linear_is_the_derivative_of_residual_in_every_regime(bench_of: BenchOf,
         assert subject.value_error < 1e-12
 
 
-@pytest.mark.parametrize("regime", ["typical", "contour", "grid_border", "track"])
+@pytest.mark.parametrize("regime", ["grid_border", "track", *_long("typical", "contour")])
 def test_terms_against_differences(bench_of: BenchOf, regime: str) -> None:
     """Differences look anew at each displaced state: the cost that is compared has the gradient that is followed."""
     for found in compare(term_experiment(bench_of(regime), _differenced(regime)), regime):
@@ -59,7 +66,7 @@ def test_a_bench_finds_minima_inside_cells_and_on_their_faces_and_borders(bench_
     assert bool((face == 1).any())
 
 
-@pytest.mark.parametrize("regime", ["typical", "grid_border"])
+@pytest.mark.parametrize("regime", ["grid_border", *_long("typical")])
 def test_rays_are_closest_where_they_are_said_to_be(bench_of: BenchOf, regime: str) -> None:
     """Marched, and tracked after a step of millimetres: nothing within 4 mm along the ray is nearer to the car."""
     bench = bench_of(regime)
@@ -87,7 +94,7 @@ def test_rays_are_closest_where_they_are_said_to_be(bench_of: BenchOf, regime: s
         assert int(smooth.sum()) > (5 if regime == "typical" else 0)
 
 
-@pytest.mark.parametrize("regime", ["typical", "far_80m"])
+@pytest.mark.parametrize("regime", ["typical", *_long("far_80m")])
 def test_sums_are_those_of_single_residuals(bench_of: BenchOf, regime: str) -> None:
     """Cost, gradient and both matrices of every column, and of what the solver sees, one residual after the other."""
     bench = bench_of(regime)
@@ -148,7 +155,7 @@ def test_a_tracked_pixel_ends_on_the_surface(bench_of: BenchOf) -> None:
     assert float(end.mean()) < 0.3 * float(here.mean())
 
 
-@pytest.mark.parametrize("regime", ["typical", "disparity_offset", "track"])
+@pytest.mark.parametrize("regime", ["disparity_offset", "track", *_long("typical")])
 def test_gradients_can_be_differentiated(bench_of: BenchOf, regime: str) -> None:
     """What gradients through a refinement are made of: the derivatives of every row's gradient, by autograd."""
     names = [name for name in _differenced(regime) if name not in AT_FIXED_DEPTHS]

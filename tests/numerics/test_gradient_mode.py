@@ -1,4 +1,4 @@
-"""What is differentiated, and which tensors have numbers of their own, in every mode of PyTorch."""
+"""What is differentiated in every mode of PyTorch."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.forward_ad import dual_level
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from directshape_torch.numerics.gradient_mode import as_constant, is_plain, nothing_is_differentiated
+from directshape_torch.numerics.gradient_mode import as_constant, nothing_is_differentiated
 
 ONES = torch.ones(2)
 
@@ -69,28 +69,3 @@ def test_a_constant_has_neither_gradient_nor_tangent() -> None:
     assert torch.equal(jvp(lambda x: x * constant(x)), ONES)
     in_between = torch.func.jacfwd(torch.func.jacfwd(lambda x: (x * x * constant(x)).sum()))(ONES)
     assert torch.equal(in_between, 2 * torch.eye(2))
-
-
-@pytest.mark.parametrize("tensor", [ONES, torch.empty(0), torch.nn.Parameter(ONES), ONES[1:], ONES.expand(3, 2)])
-def test_tensors_with_numbers_are_plain(tensor: Tensor) -> None:
-    assert is_plain(tensor)
-
-
-@pytest.mark.parametrize("transform", ["grad", "vjp", "jvp", "vmap", "functionalize", "make_fx"])
-def test_wrappers_of_transforms_are_not_plain(transform: str) -> None:
-    asked = []
-
-    def ask(x: Tensor) -> Tensor:
-        asked.append(is_plain(x))
-        return x.sum()
-
-    run = {
-        "grad": lambda: torch.func.grad(ask)(ONES),
-        "vjp": lambda: torch.func.vjp(ask, ONES),
-        "jvp": lambda: jvp(ask),
-        "vmap": lambda: torch.func.vmap(ask)(torch.ones(3, 2)),
-        "functionalize": lambda: torch.func.functionalize(ask)(ONES),
-        "make_fx": lambda: make_fx(ask, tracing_mode="fake")(ONES),
-    }
-    run[transform]()
-    assert asked == [False]

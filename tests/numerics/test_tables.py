@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import namedtuple
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -12,8 +11,8 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.records import Dense, declared
-from directshape_torch.numerics.tables import Chosen, Table, joined, of, take_rows
-from directshape_torch.rows import Blocks, PixelSamples, Rows
+from directshape_torch.numerics.tables import Chosen, Table, joined
+from directshape_torch.rows import Blocks
 
 CARS = Chosen(torch.tensor([False, True, False, True]), [1, 3])
 BLOCKS = Blocks(torch.tensor([3, 1, 0, 3, 2]), (1, 1, 1, 2))
@@ -56,12 +55,6 @@ def test_rows_of_cars_and_of_their_blocks_remain_and_owners_get_new_numbers() ->
     assert few.blocks.kept(Chosen(torch.tensor([True, False]), [0])).tolist() == [1]
 
 
-def test_no_car_leaves_tables_without_rows() -> None:
-    none = table().of(Chosen(torch.zeros(4, dtype=torch.bool), []))
-    assert none.inner.points.shape == (3, 0, 2)
-    assert none.blocks.counts == ()
-
-
 def test_tables_are_joined_car_after_car() -> None:
     whole = table()
     parts = [whole.of(CARS), whole.of(Chosen.where(torch.tensor([True, True, False, False])))]
@@ -76,41 +69,6 @@ def test_tables_are_joined_car_after_car() -> None:
     assert joined([whole], [4]).blocks.owner.tolist() == BLOCKS.owner.tolist()
 
 
-@dataclass(frozen=True)
-class Packed(Table):
-    """Pixels, and the blocks that they fill."""
-
-    pixels: PixelSamples
-    packed: Rows
-
-
-def test_packed_rows_of_some_cars_are_those_that_these_cars_are_packed_into() -> None:
-    car = torch.tensor([0] * 70 + [1] * 3 + [3] * 130)
-    numbers = torch.arange(203.0)
-    pair = torch.stack([numbers, numbers], dim=1)
-    triple = torch.cat([pair, pair[:, :1]], dim=1)
-    pixels = PixelSamples(car, pair, triple, triple, numbers, numbers, numbers, numbers)
-    few = Packed(pixels, Rows.of_sorted(car, 4)).of(CARS)
-    assert few.pixels.uv[:, 0].tolist() == numbers[70:].tolist()
-    assert few.pixels.object_index.tolist() == [0] * 3 + [1] * 130
-    anew = Rows.of_sorted(few.pixels.object_index, 2)
-    assert all(torch.equal(*pair) for pair in zip(few.packed[1:3], anew[1:3], strict=True))
-    assert few.packed.rows_of_car == anew.rows_of_car
-    assert few.packed.blocks.counts == anew.blocks.counts
-
-
-def test_rows_are_taken_by_their_numbers_in_any_order() -> None:
-    points = torch.arange(30.0).view(3, 5, 2)
-    taken = take_rows(Rowwise(points), torch.tensor([4, 0, 0]), "M")
-    assert torch.equal(taken.points, points[:, [4, 0, 0]])
-    assert take_rows(BLOCKS, torch.tensor([2, 2]), "M").owner.tolist() == [0, 0]
-
-
-def test_without_a_table_that_knows_the_cars_of_its_rows_nothing_is_taken() -> None:
-    alone = Rowwise(torch.zeros(3, 5, 2))
-    assert of(alone, CARS) is alone
-
-
 def test_types_that_only_a_type_checker_imports_are_named() -> None:
     @dataclass(frozen=True)
     class Unfinished(Table):
@@ -118,7 +76,3 @@ def test_types_that_only_a_type_checker_imports_are_named() -> None:
 
     with pytest.raises(InputError, match=r"Unfinished: .*NowhereImported.*outside of TYPE_CHECKING"):
         declared(Unfinished(None))
-
-
-def test_named_tuples_without_types_declare_nothing() -> None:
-    assert declared(namedtuple("Pair", "a b")(1, 2)) == {"a": None, "b": None}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -33,60 +34,39 @@ class Constants:
         return x * (one + other)
 
 
-def _asked_plainly(constants: Constants) -> None:
-    assert constants.product(torch.ones(2)).tolist() == [constants.first, 3.0]
+ONES = torch.ones(2)
 
 
-def _asked_in_jvp(constants: Constants) -> None:
-    ones = torch.ones(2)
-    value, slope = torch.func.jvp(constants.product, (ones,), (ones,))
-    assert value.tolist() == slope.tolist() == [constants.first, 3.0]
-
-
-def _asked_in_grad(constants: Constants) -> None:
-    slope = torch.func.grad(lambda x: constants.product(x).sum())(torch.ones(2))
-    assert slope.tolist() == [constants.first, 3.0]
-
-
-def _asked_in_functionalize(constants: Constants) -> None:
-    assert torch.func.functionalize(constants.product)(torch.ones(2)).tolist() == [constants.first, 3.0]
-
-
-def _asked_of_fakes(constants: Constants) -> None:
-    with FakeTensorMode():
-        assert constants.product(torch.ones(2)).shape == (2,)
-
-
-def _asked_by_a_tracer(constants: Constants) -> None:
+def _by_a_tracer(constants: Constants) -> Tensor:
     def product(x: Tensor) -> Tensor:  # a tracer would count the `self` of a method
         return constants.product(x)
 
-    traced = make_fx(product, tracing_mode="fake")(torch.ones(2))
-    assert traced(torch.ones(2)).tolist() == [constants.first, 3.0]
+    return make_fx(product, tracing_mode="fake")(ONES)(ONES)
 
 
-def _asked_in_inference_mode(constants: Constants) -> None:
-    with torch.inference_mode():
-        assert constants.product(torch.ones(2)).tolist() == [constants.first, 3.0]
+def _of_fakes(constants: Constants) -> Tensor:
+    with FakeTensorMode():
+        assert constants.product(torch.ones(2)).shape == (2,)
+    return constants.product(ONES)
 
 
-ASKED = (
-    _asked_plainly,
-    _asked_in_jvp,
-    _asked_in_grad,
-    _asked_in_functionalize,
-    _asked_of_fakes,
-    _asked_by_a_tracer,
-    _asked_in_inference_mode,
-)
+ASKED: dict[str, Callable[[Constants], Tensor]] = {
+    "plainly": lambda c: c.product(ONES),
+    "in jvp": lambda c: torch.func.jvp(c.product, (ONES,), (ONES,))[1],
+    "in grad": lambda c: torch.func.grad(lambda x: c.product(x).sum())(ONES),
+    "in functionalize": lambda c: torch.func.functionalize(c.product)(ONES),
+    "by a tracer": _by_a_tracer,
+    "of fakes": _of_fakes,
+    "in inference mode": torch.inference_mode()(lambda c: c.product(ONES)),
+}
 
 
-@pytest.mark.parametrize("then", range(len(ASKED)))
-@pytest.mark.parametrize("before", range(len(ASKED)))
-def test_constants_are_right_whoever_asked_before(before: int, then: int) -> None:
-    constants = Constants(10.0 + before * len(ASKED) + then)
+@pytest.mark.parametrize("then", ASKED)
+@pytest.mark.parametrize("before", ASKED)
+def test_constants_are_right_whoever_asked_before(before: str, then: str) -> None:
+    constants = Constants(10.0 + len(ASKED) * list(ASKED).index(before) + list(ASKED).index(then))
     for asked in (ASKED[before], ASKED[then]):
-        asked(constants)
+        assert asked(constants).tolist() == [constants.first, 3.0]
     for constant, numbers in zip(constants.of(torch.ones(2)), ([constants.first, 2.0], [0.0, 1.0]), strict=True):
         assert type(constant) is Tensor
         assert not constant.is_inference()

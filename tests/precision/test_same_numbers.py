@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from inexact_numbers import numbers
-from public_functions import CASES
+from public_functions import CASES, numbers
 from torch import Tensor
 
 HALF = (torch.bfloat16, pytest.param(torch.float16, marks=pytest.mark.long))

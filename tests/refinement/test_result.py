@@ -137,40 +137,25 @@ def test_meshes_of_all_cars(monkeypatch: pytest.MonkeyPatch) -> None:
         result.meshes("blender")  # type: ignore[arg-type]
 
 
-def test_a_result_prints_all_of_its_cars() -> None:
-    result = refined()
-    lines = repr(result[[0, 1] * 8]).splitlines()
-    assert lines[0] == "RefinementResult of 16 cars (torch.float64, cpu)"
-    assert lines[1] == "  16 refined (converged 8, max_iterations 8)"
-    assert [int(line.split()[0]) for line in lines[3:]] == list(range(16))
-    assert repr(result[:0]).splitlines()[1:] == ["  no cars"]
-
-
-def test_a_result_prints_whose_front_is_unknown() -> None:
-    result = refined()[[0, 1]]
-    assert "?" not in repr(result)
-    result.quality.probability_heading[1] = 0.5
-    *_, first, second, legend = repr(result).splitlines()
-    assert "?" not in first
-    assert f"{float(result.to_boxes('kitti')[1, 6]):.2f}?" in second
-    assert legend == "  ? either end may be the front (quality.probability_heading)"
-
-
-def test_a_result_of_many_cars_prints_those_that_need_a_look() -> None:
-    """Car 90 has no mask, car 70 is doubtful; the first 38 of the others fill the table."""
+def test_a_result_prints_its_cars_and_of_many_those_that_need_a_look() -> None:
+    """Car 90 has no mask, car 70 is doubtful, the front of car 1 is unknown; 38 of the others fill the table."""
     result = refined()[[0, 1] * 50]
     result.status_code[90] = Status.no_mask.code
     result.quality.probability_better[:] = 0.9
     result.quality.probability_better[70] = 0.4
+    result.quality.probability_heading[1] = 0.5
     lines = repr(result).splitlines()
+    assert lines[0] == "RefinementResult of 100 cars (torch.float64, cpu)"
     assert lines[1] == "  99 refined (converged 50, max_iterations 49), 1 as before (no_mask 1)"
     assert lines[2] == f"  no_mask: {Status.no_mask.value}"
-    assert [int(line.split()[0]) for line in lines[4:-1]] == [*range(38), 70, 90]
+    assert [int(line.split()[0]) for line in lines[4:-2]] == [*range(38), 70, 90]
+    assert [number for number, line in enumerate(lines[4:-2]) if "?" in line] == [1]
+    assert f"{float(result.to_boxes('kitti')[1, 6]):.2f}?" in lines[5]
     assert lines[-1].startswith("  60 more cars are not shown, all refined, none doubtful (better below 0.5)")
+    assert lines[-2] == "  ? either end may be the front (quality.probability_heading)"
     result.quality.probability_better[:] = 0.4
-    assert "60 more cars are not shown, 60 of them not refined or doubtful" in repr(result).splitlines()[-1]
-    result.quality.probability_better[:] = float("nan")
-    assert "all refined, none doubtful" in repr(result).splitlines()[-1]
+    assert "60 more cars are not shown, 60 of them not refined or doubtful" in repr(result)
+    assert repr(result[:0]).splitlines()[1:] == ["  no cars"]
 
 
 def test_a_refiner_and_a_result_in_half_precision_are_refused() -> None:

@@ -183,15 +183,6 @@ def test_a_residual_without_a_jacobian_is_differentiated_by_every_unknown(sees: 
     assert (nearer.abs() > 0.2).all()
 
 
-def test_a_term_that_sees_the_offset_alone_says_nothing_where_the_rig_is_known() -> None:
-    def nothing(_: CarBatch, state: CarState) -> PriorResidual:
-        rows = len(state.code), state.offset_px.shape[1]
-        return PriorResidual(state.code.new_zeros(len(state.code), 1), state.code.new_zeros(rows[0], 1, rows[1]))
-
-    found = refine(lambda *scene: PriorTerm("user", 1.0, scene[2], nothing, 1, (OFFSET,)))
-    torch.testing.assert_close(found.T_cam_obj, refine().T_cam_obj, rtol=0, atol=1e-9)
-
-
 def test_what_begins_a_term_with_a_jacobian_needs_none_itself() -> None:
     class Begins(ResidualTerm):
         def begin(self, stage: Any, prepared: Prepared) -> Any:

@@ -152,20 +152,6 @@ def test_a_rotated_right_camera_is_taken_into_account() -> None:
     assert right.cost_after[0, :3].sum() < 0.6 * wrong.cost_after[0, :3].sum()
 
 
-def test_statuses_costs_and_names_fit_together() -> None:
-    result = refined_frames()
-    assert len(result) == 3
-    assert result.cost_before.shape == result.cost_after.shape == (3, len(result.term_names))
-    assert result.term_names[:3] == ("silhouette_left", "silhouette_right", "photometric")
-    assert result.covariance.shape == (3, 9, 9)
-    assert result.covariance_xyz_yaw.shape == (3, 4, 4)
-    assert (torch.linalg.eigvalsh(result.covariance) > 0).all()
-    assert result.refined.all()
-    for car in range(3):
-        seen = result.cost_history[car][result.cost_history[car].isfinite()]
-        assert len(seen) >= int(result.iterations[car])
-
-
 def test_wrong_inputs_are_named() -> None:
     scene = cached_street()[1]
     module = refiner()

@@ -223,9 +223,6 @@ def test_half_precision_is_refused(dtype: torch.dtype) -> None:
 def test_settings_that_are_none_name_the_cure(config: object, cure: str) -> None:
     with pytest.raises(InputError, match=r"config: expected a RefinerConfig, .*" + cure):
         DirectShapeRefiner(config=config)  # type: ignore[arg-type]
-
-
-def test_settings_in_the_place_of_the_prior_are_named() -> None:
     with pytest.raises(InputError, match=r"prior: expected a ShapePrior, got RefinerConfig; pass it as config="):
         DirectShapeRefiner(DEFAULT)  # type: ignore[arg-type]
 
@@ -257,13 +254,6 @@ def test_what_the_caller_writes_into_his_dimensions_is_not_in_the_result() -> No
     assert torch.equal(result.input_dimensions_hwl, before)
 
 
-def test_frames_may_be_numbered_in_32_bits() -> None:
-    frames, detections = base()
-    frames = replace(frames, sizes=frames.sizes.int())
-    result = refine(frames, replace(detections, frame_index=detections.frame_index.int()))
-    assert torch.equal(result.T_cam_obj, healthy().T_cam_obj)
-
-
 @pytest.mark.parametrize("frames_too", [False, True])
 def test_no_cars(frames_too: bool) -> None:
     frames, detections = base()
@@ -284,6 +274,7 @@ def test_no_cars(frames_too: bool) -> None:
     assert result.status == []
     assert result.boxes().dimensions_hwl.shape == (0, 3)
     assert result.covariance.shape == (0, 9, 9)
+    assert result.profile.after.offset_px.shape == (0,)
 
 
 def test_a_car_that_is_not_refined_keeps_the_detectors_box_and_has_no_figures() -> None:
@@ -304,9 +295,11 @@ def test_nearer_cars_hide_right_pixels_even_of_cars_without_a_right_mask_and_whe
     """What hides a car in the right image is known from all detections, wherever the warp may land."""
     frames, detections = base()
     everything = torch.ones_like(detections.mask_right.dense()[:1])
+    at_camera = detections.T_cam_obj[:1].clone()
+    at_camera[:, 2, 3] = 0.9
     wall = replace(
         select(detections, torch.tensor([0])),
-        T_cam_obj=_at_depth(detections.T_cam_obj[:1], 0.9),
+        T_cam_obj=at_camera,
         mask_left=torch.zeros_like(everything),
         mask_right=everything,
     )
@@ -316,9 +309,3 @@ def test_nearer_cars_hide_right_pixels_even_of_cars_without_a_right_mask_and_whe
     assert result.status[1] is Status.behind_camera
     # Every right pixel is behind the wall, so nothing can be compared photometrically.
     assert not (result.quality.matched_share[0] > 0)
-
-
-def _at_depth(T_cam_obj: Tensor, depth_m: float) -> Tensor:
-    moved = T_cam_obj.clone()
-    moved[:, 2, 3] = depth_m
-    return moved

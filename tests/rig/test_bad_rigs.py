@@ -12,7 +12,7 @@ import torch
 from helpers.rig_rows import FIELD, SIZE_WH, estimate, rows_of_cars
 from torch import Tensor
 
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.errors import DataFormatError
 from directshape_torch.geometry.disparity_field import polynomial_basis
 from directshape_torch.rig.rig_file import load_rigs, save_rigs
 
@@ -101,10 +101,3 @@ def test_what_is_no_file_of_rigs_is_refused(tmp_path: Path, text: str) -> None:
     path.write_text(text)
     with pytest.raises(DataFormatError, match="calibrate-rig"):
         load_rigs(path)
-
-
-@pytest.mark.parametrize(("size_wh", "focal_px"), [((1224, 370), 721.0), (SIZE_WH, 707.0)])
-def test_a_file_of_other_images_or_calibration_is_refused(size_wh: tuple[int, int], focal_px: float) -> None:
-    other = estimate(size_wh=size_wh, focal_px=focal_px).field
-    with pytest.raises(InputError, match=r"expected .*, got .*; estimate this rig with 'directshape calibrate-rig'"):
-        estimate().field.check_rig(*other.rig)

@@ -16,11 +16,10 @@ from torch import Tensor
 
 from directshape_torch import DirectShapeRefiner, RigEstimate
 from directshape_torch.cli.demo import DEMO_FOLDER
-from directshape_torch.geometry.disparity_field import EXPONENTS, polynomial_basis
+from directshape_torch.geometry.disparity_field import polynomial_basis
 from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.rig.from_files import estimate_rigs
 from directshape_torch.rig.pixels import pixel_evidence
-from directshape_torch.rig.posterior import BIAS, SETBACK
 from directshape_torch.rig.rig_file import load_rigs, save_rigs
 from directshape_torch.scene.detections import Detections
 from directshape_torch.state.cars import CarBatch
@@ -35,7 +34,7 @@ def true_offset(uv: Tensor) -> Tensor:
 def test_errors_are_as_large_as_the_estimate_says() -> None:
     """Standardised errors of offset, bias and noise over draws of 60 detections."""
     offsets, biases, noises = [], [], []
-    for seed in range(50):
+    for seed in range(25):
         rig = estimate(rows_of_cars(60, seed, bias=-0.02))
         mean, sigma = rig.offset_at(PLACES)
         offsets.append((mean - true_offset(PLACES)) / sigma)
@@ -46,21 +45,6 @@ def test_errors_are_as_large_as_the_estimate_says() -> None:
     assert float((z.abs() < 2).double().mean()) > 0.9
     assert 0.4 < float(torch.tensor(biases).square().mean().sqrt()) < 1.3
     assert float(torch.tensor(noises).mean()) == pytest.approx(0.03, abs=0.008)
-
-
-def test_where_nothing_is_known_rectification_leaves_some_tenths_of_a_pixel() -> None:
-    """Degree by degree, over four rigs from one that is off by as much to one that is exact; the common errors."""
-    some_rigs = math.sqrt((1 + 0.5**2 + 0.25**2 + 0.05**2) / 4)
-    sigma = estimate().covariance.diagonal().sqrt()
-    by_degree = torch.tensor([(0.4, 0.4, 0.5, 0.3, 0.5)[i + j] for i, j in EXPONENTS], dtype=torch.float64)
-    torch.testing.assert_close(sigma[:BIAS], some_rigs * by_degree)
-    assert sigma[SETBACK:].tolist() == pytest.approx([0.15, 0.04, 0.25])
-
-
-def test_a_single_car_moves_the_rows_of_the_middle() -> None:
-    """By its own 0.02 px less what a prior of 0.4 px says against 0.1 px of noise."""
-    middle = torch.tensor([[0.5 * SIZE_WH[0], 0.5 * SIZE_WH[1], 20.0, 0.0, 0.05, 0.02, 0.0, 0.0]], dtype=torch.float64)
-    assert float(estimate(middle).field.offsets(middle[:, :2])[1]) == pytest.approx(0.02 * 0.95, rel=0.02)
 
 
 def test_a_biased_detector_leaves_the_field_unharmed() -> None:
@@ -76,7 +60,7 @@ def test_order_and_portions_do_not_matter_to_the_bit() -> None:
     rows = rows_of_cars(1300, 2)
     at_once, by_and_by = estimate(rows), estimate()
     shuffled = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))]
-    for part in (*shuffled.split(137), rows[:200]):  # some of them again
+    for part in (*shuffled.split(450), rows[:200]):  # some of them again
         by_and_by.add_rows(part)
     assert torch.equal(at_once.mean, by_and_by.mean)
     assert torch.equal(at_once.covariance, by_and_by.covariance)

@@ -117,7 +117,9 @@ def calibrate(root: Path, *more: str) -> int:
     return int(args.run(args))
 
 
-def test_command_finds_a_constant_bias_in_images(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_finds_a_constant_bias_in_images_and_evidence_of_a_file_stays(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_frame(tmp_path, "000001", bias_px=-0.6)
     assert calibrate(tmp_path) == 0
     (field,) = (each.field for each in load_rigs(tmp_path / "bias.json"))
@@ -125,6 +127,9 @@ def test_command_finds_a_constant_bias_in_images(tmp_path: Path, capsys: pytest.
     torch.testing.assert_close(bias, torch.full((3,), -0.6, dtype=torch.float64), atol=0.05, rtol=0)
     assert (tmp_path / "bias.png").is_file()
     assert "px in the middle, from disparity (1 frames)" in capsys.readouterr().out
+    assert calibrate(tmp_path, "--rig", str(tmp_path / "bias.json")) == 0
+    (rig,) = load_rigs(tmp_path / "bias.json")
+    assert rig.pixels["disparity"].num_frames == 2
 
 
 def test_command_reports_a_damaged_frame_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -136,14 +141,6 @@ def test_command_reports_a_damaged_frame_and_goes_on(tmp_path: Path, capsys: pyt
     assert "000002 left out" in capsys.readouterr().err
     (rig,) = load_rigs(tmp_path / "bias.json")
     assert rig.pixels["disparity"].num_frames == 1
-
-
-def test_evidence_of_a_file_stays(tmp_path: Path) -> None:
-    write_frame(tmp_path, "000001", bias_px=-0.6)
-    assert calibrate(tmp_path) == 0
-    assert calibrate(tmp_path, "--rig", str(tmp_path / "bias.json")) == 0
-    (rig,) = load_rigs(tmp_path / "bias.json")
-    assert rig.pixels["disparity"].num_frames == 2
 
 
 def test_each_of_two_rigs_has_its_estimate_and_unknown_frames_are_refused(tmp_path: Path) -> None:

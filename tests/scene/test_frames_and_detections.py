@@ -25,12 +25,6 @@ from directshape_torch.status import Status
 
 def test_a_flipped_baseline_is_refused() -> None:
     K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
-    left = torch.cat([K, torch.zeros(3, 1)], dim=1)[None]
-    right = torch.cat([K, torch.tensor([[378.0], [0.0], [0.0]])], dim=1)[None]
-    with pytest.raises(
-        InputError, match=r"P_right: expected fourth columns .* 378\.0.* in row 0; swap P_left and P_right"
-    ):
-        StereoCamera.from_projections(left, right)
     T_right_cam = torch.eye(4)[None].clone()
     T_right_cam[0, 0, 3] = 0.54
     with pytest.raises(InputError, match=r"T_right_cam: .* got baseline -0\.5400 m; swap"):
@@ -60,16 +54,6 @@ def test_poses_may_be_rounded_or_unknown() -> None:
     assert len(replace(detections, T_cam_obj=T_cam_obj)) == 2
     some = replace(detections, other_T_cam_obj=T_cam_obj[:, None])
     assert some.rows(torch.tensor([1])).to(dtype=torch.float32).other_T_cam_obj.equal(T_cam_obj[1:, None].float())
-
-
-def test_images_of_0_to_255_are_refused_and_nan_is_not() -> None:
-    frames = cached_street()[1].frames
-    for name in ("images_left", "images_right"):
-        with pytest.raises(InputError, match=rf"{name}: expected values in \[0, 1\], got .*; divide by 255"):
-            replace(frames, **{name: 255 * getattr(frames, name)})
-    spoiled = frames.images_left.clone()
-    spoiled[0, 0, 0, :2] = torch.tensor([torch.nan, torch.inf], dtype=spoiled.dtype)
-    assert len(replace(frames, images_left=1.005 * spoiled)) == 1
 
 
 @pytest.mark.parametrize("unknown", [0.5, torch.nan, torch.inf, -torch.inf])
@@ -138,9 +122,6 @@ def test_wrong_frames_are_named(changes: dict[str, Any], text: str) -> None:
         ("dimensions_hwl", torch.zeros(3, 3), "expected shape"),
         ("box_2d", torch.zeros(2, 5), "expected shape"),
         ("mask_left", torch.zeros(3, 120, 160), "expected 2 masks, one for each instance, got 3"),
-        ("mask_right", torch.zeros(120, 160), "expected shape (B, H, W), got (120, 160)"),
-        ("mask_right", torch.zeros(2, 120, 160).long(), "in floating point, got torch.int64; divide by 255"),
-        ("mask_left", None, "expected masks (B, H, W), or B entries that are (H, W) or None, got NoneType"),
     ],
 )
 def test_detections_of_the_wrong_type_are_named(name: str, wrong: Any, text: str) -> None:

@@ -58,17 +58,6 @@ def test_rows_of_crops_can_be_left_out() -> None:
     assert not len(MaskCrops.of(masks).rows(end[:0]).above(end[:0]))
 
 
-def test_corners_and_whole_frames() -> None:
-    masks = torch.zeros(5, 4, 6)
-    masks[0, 3, 5] = masks[1, 0, 0] = masks[3] = 1.0
-    masks[4, 0, 0] = masks[4, 3, 5] = 1.0
-    crops = MaskCrops.of(masks)
-    assert crops.extents.tolist() == [[5, 3, 6, 4], [0, 0, 1, 1], [0, 0, 0, 0], [0, 0, 6, 4], [0, 0, 6, 4]]
-    assert crops.areas.tolist() == [1, 1, 0, 24, 2]
-    assert crops.box_2d[:2].tolist() == [[5, 3, 5, 3], [0, 0, 0, 0]]
-    assert crops.box_2d[2].isnan().all()
-
-
 SQUARE = np.zeros((4, 6), dtype=bool)
 SQUARE[1:3, 2:5] = True
 

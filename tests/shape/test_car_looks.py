@@ -33,7 +33,7 @@ def vector(axis: str) -> Array:
 
 @cache
 def body(body_type: str) -> trimesh.Trimesh:
-    return car_mesh(sample_car(3, body_type), spacing_m=0.06)
+    return car_mesh(sample_car(3, body_type), spacing_m=0.1)
 
 
 def car(body_type: str = "saloon") -> trimesh.Trimesh:
@@ -171,14 +171,14 @@ def test_corners_that_single_precision_rounds_are_refused(tmp_path: Path) -> Non
             load_mesh_obj(saved(far, tmp_path, "stl"), MeshOptions(are_cars=are_cars))
 
 
-@pytest.mark.parametrize("first", [0, *(pytest.param(rest, marks=pytest.mark.long) for rest in (1, 2))])
-def test_real_cars_pass_and_their_turns_are_named(first: int) -> None:
+@pytest.mark.parametrize("step", [7, pytest.param(1, marks=pytest.mark.long)])
+def test_real_cars_pass_and_their_turns_are_named(step: int) -> None:
     root = os.environ.get("DIRECTSHAPE_DATA")
     if root is None:
         pytest.skip("DIRECTSHAPE_DATA is not set: no real meshes at hand")
     files = [file for file in sorted((Path(root) / "meshes").rglob("*")) if file.suffix in (".obj", ".glb")]
     assert len(files) >= 21
-    for file in files[first::3]:
+    for file in files[::step]:
         right, wrong = MeshOptions(), MeshOptions(forward_axis="+z", up_axis="+y")
         if file.suffix == ".glb":
             right, wrong = wrong, right

@@ -101,14 +101,17 @@ def test_the_refine_command_takes_another_kind_than_pca(tmp_path: Path) -> None:
     root.mkdir()
     write_data_set(root, ("000000",))
     words = ["refine", "--data", root, "--detections", root / "detections", "--masks", root / "masks", "--out", out]
-    options = ["--prior", write("neural", tmp_path), "--device", "cpu", "--overlays"]
+    options = ["--prior", write("neural", tmp_path), "--device", "cpu"]
+    trusting = ["acceptance.min_probability_better=0", "acceptance.min_probability_not_worse=0"]
     settings = [
         "--set",
         "stages=[{max_iterations: 2}]",
-        "acceptance.min_probability_better=0",
-        "acceptance.min_probability_not_worse=0",
+        "check=off",
+        "search=off",
+        "sampling.max_pixels=200",
+        *trusting,
     ]
-    assert main([str(word) for word in (*words, *options, *settings)]) == 0
+    assert main([str(word) for word in (*words, *options, *settings, "sampling.min_pixels=100")]) == 0
     shapes = read_shapes(out / "shapes" / "000000.npz")
     assert shapes.codes.shape == (2, prior_of("neural").num_codes)
     refined = [Status[status].is_refined for status in shapes.statuses]

@@ -179,8 +179,6 @@ def test_attached_depths_have_the_right_derivatives() -> None:
     torch.testing.assert_close(second, h**2 / root**3, rtol=1e-2, atol=0)
 
 
-# A search that takes several goes
-
 # One ray, slightly inclined, over the roof: its least distance is at x = 0.5 or so.
 CENTRE = torch.tensor([-4.0, -1.9, 0.1]).double().view(3, 1, 1)
 DIRECTION = torch.tensor([1.0, 0.03, -0.02]).double().view(3, 1, 1)
@@ -227,6 +225,8 @@ FUNCTIONS = {
     "kink": lambda x: torch.where(x < 0.4, 0.401 - x, 0.001 - 4 * (x - 0.4)),
     "steep": lambda x: 1 - torch.exp(3 * (x - 0.2)),
 }
+
+
 ROOTS = {"straight": 0.3, "hollow": 1 - 0.01 ** (1 / 3), "bulging": 0.99 ** (1 / 3), "kink": 0.40025, "steep": 0.2}
 
 

@@ -129,18 +129,6 @@ def test_the_last_faces_belong_to_their_cells() -> None:
     torch.testing.assert_close(shape.value_and_derivatives(at, index).gradient, by_autograd)
 
 
-@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
-def test_points_that_are_not_finite_disturb_no_others(look_up: LookUp, bad: float) -> None:
-    field, at, owner = random_shape(), points(20).mT.reshape(3, 20, 1).contiguous(), torch.arange(20) % 2
-    clean = look_up(field, at, owner)
-    at[1, 7] = bad
-    broken = look_up(field, at, owner)
-    others = (torch.arange(20) != 7).nonzero()[:, 0]
-    assert not broken.value[7].isfinite()
-    for mine, theirs, axis in zip(broken, clean, (0, 1, 0), strict=True):
-        assert torch.equal(mine.index_select(axis, others), theirs.index_select(axis, others))
-
-
 @pytest.mark.parametrize("by", ["forward transform", "reverse transform", "dual numbers"])
 def test_differentiation_needs_no_gradient_mode(by: str) -> None:
     """Where there is no distance from the grid, a derivative that takes it for a constant is NaN."""

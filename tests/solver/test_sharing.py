@@ -13,7 +13,7 @@ from directshape_torch.config import SolverConfig, StageConfig
 from directshape_torch.numerics.tables import Chosen
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.gauss_newton import minimise
-from directshape_torch.solver.sharing import INDEPENDENT, Groups
+from directshape_torch.solver.sharing import Groups
 from directshape_torch.status import Status
 
 EXACT = SolverConfig(cost_tolerance=1e-15, step_tolerance=1e-15)
@@ -174,16 +174,6 @@ def test_groups_end_at_their_common_minimum(over_relaxation: float) -> None:
         # To the bit: it is one shape.
         shared = result.end.x[members(name), FIRST:END]
         assert (shared == shared[0]).all()
-
-
-def test_groups_of_one_are_problems_by_themselves() -> None:
-    problem, _ = sharing_problem()
-    problem.sharing = INDEPENDENT
-    apart = minimise(problem, zeros(), EXACT)
-    problem.sharing = groups(tuple(range(len(GROUP))))
-    together = minimise(problem, zeros(), EXACT)
-    torch.testing.assert_close(together.end.x, apart.end.x, rtol=1e-6, atol=1e-7)
-    assert together.status.tolist() == apart.status.tolist()
 
 
 def test_a_problem_without_numbers_drops_out_of_its_group() -> None:

@@ -80,7 +80,7 @@ def seen(frames: FrameBatch, masks: MaskCrops) -> list[bool]:
     return found.flatten().tolist()
 
 
-def with_object(frames: FrameBatch, depth_m: float, columns: slice, rows: slice = slice(*CAR_ROWS)) -> FrameBatch:
+def with_object(frames: FrameBatch, depth_m: float, columns: slice, rows: slice) -> FrameBatch:
     assert frames.disparity is not None
     disparity = frames.disparity.clone()
     disparity[0, rows, columns] = FOCAL_PX * BASELINE_M / depth_m
@@ -96,34 +96,23 @@ def test_the_border_of_the_image_cuts_off(columns: tuple[int, int], expected: li
     assert seen(*scene(12.0, columns)) == expected
 
 
-def test_what_is_nearer_hides_the_end_beside_it() -> None:
-    frames, masks = scene(12.0)
-    assert seen(with_object(frames, 9.0, slice(200, 250)), masks) == [False, True]
-    assert seen(with_object(frames, 9.0, slice(350, 365)), masks) == [True, False]
+# At 9 m the road is seen in row 80 + 700 * 1.65 / 9 = 208, so that rows from 185 on are at most 0.3 m above it.
+LEFT, WHOLE, LOWER, ROAD = slice(200, 250), slice(*CAR_ROWS), slice(125, 165), slice(185, 200)
+BESIDE = {
+    "nearer, on the left": (12.0, 9.0, LEFT, WHOLE, [False, True]),
+    "nearer, on the right": (12.0, 9.0, slice(350, 365), WHOLE, [True, False]),
+    "nearer, beside the lower part": (12.0, 9.0, LEFT, LOWER, [False, True]),
+    "as near": (12.0, 12.1, LEFT, WHOLE, [True, True]),
+    "behind": (12.0, 20.0, LEFT, WHOLE, [True, True]),
+    "the road": (12.0, 9.0, LEFT, ROAD, [True, True]),
+    "beside the few columns of a far car": (40.0, 9.0, LEFT, WHOLE, [True, True]),
+}
 
 
-def test_what_is_beside_or_behind_the_car_hides_nothing() -> None:
-    frames, masks = scene(12.0)
-    assert seen(with_object(frames, 12.1, slice(200, 250)), masks) == [True, True]
-    assert seen(with_object(frames, 20.0, slice(200, 250)), masks) == [True, True]
-
-
-def test_the_road_hides_nothing() -> None:
-    frames, masks = scene(12.0)
-    # At 9 m the road is seen in row 80 + 700 * 1.65 / 9 = 208, so that these rows are at most 0.3 m above it.
-    assert seen(with_object(frames, 9.0, slice(200, 250), slice(185, 200)), masks) == [True, True]
-
-
-def test_what_touches_the_lower_part_alone_hides_too() -> None:
-    frames, masks = scene(12.0)
-    assert seen(with_object(frames, 9.0, slice(200, 250), slice(125, 165)), masks) == [False, True]
-
-
-def test_columns_of_far_cars_count_all_the_same() -> None:
-    frames, masks = scene(40.0)
-    assert seen(with_object(frames, 9.0, slice(200, 250)), masks) == [True, True]
-
-
-def test_no_masks_have_no_ends() -> None:
-    frames, masks = scene(12.0)
+@pytest.mark.parametrize(("car_m", "depth_m", "columns", "rows", "expected"), BESIDE.values(), ids=BESIDE)
+def test_what_is_nearer_than_the_car_hides_the_end_beside_it(
+    car_m: float, depth_m: float, columns: slice, rows: slice, expected: list[bool]
+) -> None:
+    frames, masks = scene(car_m)
+    assert seen(with_object(frames, depth_m, columns, rows), masks) == expected
     assert seen(frames, masks.rows(torch.zeros(0, dtype=torch.int64))) == []

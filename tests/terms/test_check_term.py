@@ -126,14 +126,6 @@ def test_a_mistake_in_a_term_is_named_when_the_problem_is_made(case: str) -> Non
         refiner.problem(scene.frames, scene.detections)
 
 
-def test_a_member_that_is_missing_is_named() -> None:
-    class Bare:
-        names = ("user",)
-
-    with pytest.raises(InputError, match=r"extra term Bare: expected the members of `Term`, got none called blocks"):
-        refine(lambda *_: Bare())  # type: ignore[arg-type, return-value]
-
-
 REQUIRED = ("names", "blocks", "block_weight", "information", "row_weight", "residual", "norm")
 
 

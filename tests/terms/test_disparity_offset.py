@@ -18,7 +18,6 @@ from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
-from directshape_torch.state.cars import CarBatch
 from directshape_torch.terms.photometric import warped_depth
 from directshape_torch.terms.priors import rig_prior
 
@@ -70,17 +69,6 @@ def test_an_offset_does_what_a_constant_field_does(level: int) -> None:
     for one, other in zip(*found, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
     assert found[0][3].min() > 50
-
-
-def test_an_offset_changes_the_inverse_depth_by_focal_length_and_baseline() -> None:
-    scene = rectified_street()
-    sigma_px = torch.tensor([1.0, 0.0]).double()
-    cars = CarBatch.from_scene(scene.frames, replace(scene.detections, offset_sigma_px=sigma_px))
-    per_pixel = 1 / (scene.frames.camera.K_left[0, 0, 0] * 0.53)
-    assert cars.inverse_depth_of_pixel is not None
-    torch.testing.assert_close(
-        cars.inverse_depth_of_pixel, torch.stack([per_pixel, torch.zeros_like(per_pixel)])[:, None]
-    )
 
 
 def test_warp_and_prior_by_hand() -> None:

@@ -10,11 +10,11 @@ from typing import Annotated, Any
 import pytest
 import torch
 from helpers.problems import DEFAULT
-from helpers.street_inputs import StreetInputs, with_mode
+from helpers.street_inputs import SETTLED, StreetInputs, with_mode
 from helpers.synthetic_scene import cached_street, disturbed, select
 from torch import Tensor
 
-from directshape_torch.config import RefinerConfig
+from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.records import Dense
@@ -111,10 +111,6 @@ def test_cars_that_are_refused_take_their_values_along() -> None:
     torch.testing.assert_close(result.T_cam_obj[others], together().T_cam_obj[others], rtol=0, atol=1e-9)
 
 
-def test_no_car_at_all() -> None:
-    assert len(refine(radar(), detections=select(boxes(), torch.zeros(0, dtype=torch.long))).status) == 0
-
-
 def test_views_of_a_track_have_values_of_their_own() -> None:
     """Two frames of one street, and a radar that sees its cars 3 cm to the left, then 3 cm to the right."""
     prior, scene = cached_street()
@@ -132,11 +128,12 @@ def test_gradients_reach_the_values() -> None:
     detections = replace(inputs.detections, mask_left=inputs.mask)
     metres = torch.zeros((), dtype=torch.float64, requires_grad=True)
     factories = radar(lambda x: x + metres), closed_over(of_detections, lambda x: x + metres)
-    refiners = [DirectShapeRefiner(inputs.prior, with_mode("unroll"), [make]) for make in factories]
+    few = replace(SETTLED, stages=(StageConfig(1.0, 0, 2),))
+    refiners = [DirectShapeRefiner(inputs.prior, with_mode("unroll", few), [make]) for make in factories]
     heights = [refiner(inputs.scene.frames, detections).T_cam_obj[:, 1, 3].sum() for refiner in refiners]
     gradient, by_closure = (float(torch.autograd.grad(height, metres)[0]) for height in heights)
     assert gradient == pytest.approx(by_closure, rel=1e-9)
-    assert gradient > 1.0
+    assert gradient > 0.5
 
 
 WRONG: dict[str, tuple[Callable[[Tensor], Any], str]] = {
@@ -163,16 +160,6 @@ def test_wrong_values_are_named(case: str) -> None:
         refine(radar(change), detections=boxes())
 
 
-def test_values_by_names_that_the_residual_does_not_know_are_named() -> None:
-    with pytest.raises(InputError, match=r"^extra term 'radar'.*unexpected keyword argument 'rader_cam'"):
-        refine(radar(name="rader_cam"), detections=boxes())
-
-
-def test_a_weight_for_each_car_is_named() -> None:
-    with pytest.raises(InputError, match=r"^extra term 'radar': weight: expected a number, .*term_weights="):
-        refine(radar(weight=torch.ones(6)), detections=boxes())
-
-
 CLOSED: dict[str, Callable[..., Tensor]] = {
     "all rows": lambda table, _: table,
     "the first rows": lambda table, cars: table[: len(cars)],
@@ -182,7 +169,7 @@ CLOSED: dict[str, Callable[..., Tensor]] = {
 LEAVING = r"hand tensors of the cars to PriorTerm\(values=...\)"
 
 
-@pytest.mark.parametrize("detections", [(0, 1), (0, 1, 2), (0, 1, 2, 3, 4, 5)], ids=len)
+@pytest.mark.parametrize("detections", [(0, 1), (0, 1, 2, 3, 4, 5)], ids=len)
 @pytest.mark.parametrize("case", CLOSED)
 def test_a_residual_that_mistakes_the_cars_is_named_before_the_first_step(case: str, detections: Sequence[int]) -> None:
     prior, scene = cached_street()
@@ -209,11 +196,6 @@ def test_a_factory_that_mixes_detections_and_cars_is_named() -> None:
 
     with pytest.raises(InputError, match=r"^extra term of .*mixing: expected values for 5 cars, .*cars.detection_row"):
         refine(mixing, detections=replace(detections, T_cam_obj=behind))
-
-
-def test_rows_found_by_the_numbers_of_the_detections_are_right() -> None:
-    by_hand = refine(closed_over(of_detections), detections=boxes())
-    torch.testing.assert_close(by_hand.T_cam_obj, together().T_cam_obj, rtol=0, atol=1e-12)
 
 
 @dataclass(frozen=True)
@@ -243,12 +225,15 @@ def test_a_declared_table_goes_with_its_cars() -> None:
     torch.testing.assert_close(kept.T_cam_obj, together().T_cam_obj, rtol=0, atol=1e-12)
 
 
-def test_a_table_without_declaration_is_named() -> None:
-    message = r"^extra term 'radar': table: expected a declaration of its axes, got none; .*Dense\(\"B\""
-    with pytest.raises(InputError, match=message):
-        refine(keeping(Undeclared), detections=boxes())
-
-
-def test_a_table_of_other_rows_than_declared_is_named() -> None:
-    with pytest.raises(InputError, match=r"^extra term 'radar': table: expected shape \(6, 3\), got \(5, 3\)"):
-        refine(keeping(Keeping, lambda x: x[1:]), detections=boxes())
+@pytest.mark.parametrize(
+    ("factory", "message"),
+    [
+        (radar(name="rader_cam"), ".*unexpected keyword argument 'rader_cam'"),
+        (radar(weight=torch.ones(6)), ": weight: expected a number, .*term_weights="),
+        (keeping(Undeclared), r": table: expected a declaration of its axes, got none; .*Dense\(\"B\""),
+        (keeping(Keeping, lambda x: x[1:]), r": table: expected shape \(6, 3\), got \(5, 3\)"),
+    ],
+)
+def test_other_mistakes_are_named(factory: TermFactory, message: str) -> None:
+    with pytest.raises(InputError, match="^extra term 'radar'" + message):
+        refine(factory, detections=boxes())

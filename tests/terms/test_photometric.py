@@ -16,7 +16,7 @@ from torch import Tensor
 from directshape_torch.config import RefinerConfig
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.state.cars import CarState
-from directshape_torch.terms.photometric import Brightness, is_grazing
+from directshape_torch.terms.photometric import Brightness
 from directshape_torch.terms.photometric_rows import DSO_PATTERN, GRADIENT_CONSTANT, compared, residuals_at
 from directshape_torch.terms.robust import huber
 
@@ -58,14 +58,6 @@ def test_residuals_at_any_depth_are_the_references_and_have_its_slope(regime: st
     several, comparable_there = residuals_at(rows, torch.stack([depth, 1.2 * depth]))
     torch.testing.assert_close(several[0], residual)
     assert torch.equal(comparable_there[0], comparable)
-
-
-def test_grazing_rays_are_those_below_the_cosine() -> None:
-    # |grad . ray| / (|grad| |ray|) is 0.099 and 0.101.
-    cosine = torch.tensor([0.099, 0.101], dtype=torch.float64)
-    normal = torch.tensor([0.5, 0.0, 0.0], dtype=torch.float64).view(3, 1, 1).expand(3, 1, 2)
-    direction = 3 * torch.stack([cosine, 0 * cosine, (1 - cosine**2).sqrt()])[:, None]
-    assert is_grazing(normal, direction)[0].tolist() == [True, False]
 
 
 @pytest.mark.parametrize("config", CONFIGS)

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from helpers.ellipsoids import CENTRE_OBJ, HALF_AXES, ellipsoid_prior
-from helpers.problems import begun_stage
-from helpers.synthetic_scene import disturbed, measured_street
-from helpers.term_cases import COMBINED
 from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.geometry import se3
-from directshape_torch.refinement.problem import CarStage
 from directshape_torch.rows import PointSamples
 from directshape_torch.shape.field import field_of
 from directshape_torch.state.cars import CarState
@@ -66,12 +60,6 @@ def test_the_fisher_matrix_has_the_weight_that_the_norm_gives_it() -> None:
     at = term.linear(field_of(PRIOR.bind(state.code)), state, ())
     J, weight = at.J_inner_state[0, :5], 3 + at.residual[0, :5]
     torch.testing.assert_close(part_of(term, at).information[0], J.mT @ (weight * J))
-
-
-def _of(config: PointCloudConfig) -> tuple[CarStage, CarState]:
-    prior, scene = measured_street()
-    settings = replace(COMBINED, point_cloud=config)
-    return begun_stage(prior, scene.frames, disturbed(scene.detections, 0.08, 0.03), settings, 0)
 
 
 def test_a_car_without_enough_points_has_no_part_in_the_term() -> None:

@@ -79,9 +79,6 @@ def test_log_one_minus_exp_keeps_its_digits() -> None:
     assert log_one_minus_exp(torch.zeros(1)).isfinite().all()
 
 
-# In an energy
-
-
 @pytest.mark.parametrize("form", ["closest_approach", "product"])
 def test_a_ray_that_misses_the_bounds_counts_as_background(
     form: Literal["closest_approach", "product"], monkeypatch: pytest.MonkeyPatch
@@ -110,6 +107,9 @@ def test_products_are_the_same_with_gradients_on() -> None:
         torch.testing.assert_close(differentiable, term.linear(field, state, ()))
 
 
+# Where the contour of the rendered silhouette lies
+
+
 def test_zeta_comes_from_the_input_depth_and_not_from_the_state() -> None:
     prior, scene = cached_street()
     detections = disturbed(scene.detections)
@@ -126,8 +126,6 @@ def test_zeta_comes_from_the_input_depth_and_not_from_the_state() -> None:
     assert torch.equal(again.zeta, term.zeta)
     torch.testing.assert_close(softer.zeta, term.zeta / 4)
 
-
-# Where the contour of the rendered silhouette lies
 
 FOCAL_PX = 720.0
 CAR = Ellipsoid(vector(2.0, 0.75, 0.85), vector(0.0, -0.75, 0.0), 0.75)

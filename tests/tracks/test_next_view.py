@@ -9,12 +9,11 @@ import pytest
 import torch
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import DEFAULT
-from helpers.synthetic_scene import CAMERA_HEIGHT_M, Street, joined_detections, joined_frames, masked, street
+from helpers.synthetic_scene import CAMERA_HEIGHT_M, Street, joined_detections, joined_frames, street
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.geometry import se3
-from directshape_torch.numerics.tables import Chosen
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene.detections import Detections
@@ -133,20 +132,6 @@ def test_one_car_looks_alike_in_the_next_view_a_little_beside_itself_too() -> No
         assert (beside[:4] < most).all()
 
 
-def test_another_car_does_not_look_alike() -> None:
-    frames, detections = drive()
-    grey = frames.images_left.clone()
-    # In the second frame the car at the left is painted as nobody was.
-    painted = detections.mask_left[2] > 0
-    grey[1, :, painted] = 1 - grey[1, :, painted]
-    even = torch.where(detections.mask_left.dense().view(3, 2, 1, 120, 160).amax(dim=1) > 0, 0.3, frames.images_left)
-    for images, least, most in ((frames.images_left, 0.97, 1.0), (grey, -1.0, 0.5), (even, 0.8, 1.0)):
-        problem, state = at_truth(replace(frames, images_left=images), detections)
-        term, prepared = begun(problem, state)
-        alike, _ = term.likeness(prepared)
-        assert least < alike[0] < most
-
-
 def test_a_side_that_has_turned_away_does_not_count() -> None:
     frames, detections = drive()
     # Nothing but the way that the surface faces keeps its pixels out.
@@ -159,15 +144,6 @@ def test_a_side_that_has_turned_away_does_not_count() -> None:
     assert counts[1] < 0.3 * counts[0]
 
 
-def test_a_next_view_without_a_left_mask_shows_nothing() -> None:
-    frames, detections = drive()
-    detections = masked(detections, torch.arange(len(detections)) != 2)
-    term, _ = begun(*at_truth(frames, detections))
-    counted = term.row_weight[..., 0].sum(dim=1)
-    assert (counted[term.blocks.owner == 0] == 0).all()
-    assert (counted[term.blocks.owner == 1] > 0).any()
-
-
 def shifted(values: Tensor, row: int, by: int) -> Tensor:
     """Values (N, ..., W) of which one row has lost its first columns, padded at the end."""
     values = values.clone()
@@ -175,10 +151,9 @@ def shifted(values: Tensor, row: int, by: int) -> Tensor:
     return values
 
 
-@pytest.mark.parametrize("stage", [0, 1])
-def test_the_next_frame_may_have_another_camera_and_size(stage: int) -> None:
+def test_the_next_frame_may_have_another_camera_and_size() -> None:
     frames, detections = drive()
-    whole, prepared = begun(*at_truth(frames, detections), stage)
+    whole, prepared = begun(*at_truth(frames, detections))
     K_left, K_right = frames.camera.K_left.clone(), frames.camera.K_right.clone()
     K_left[1, 0, 2] -= 8
     K_right[1, 0, 2] -= 8
@@ -187,7 +162,7 @@ def test_the_next_frame_may_have_another_camera_and_size(stage: int) -> None:
     cut = replace(frames, camera=replace(frames.camera, K_left=K_left, K_right=K_right), sizes=sizes, **images)
     masks = {name: getattr(detections, name).dense() for name in ("mask_left", "mask_right")}
     masks = {name: shifted(shifted(mask, 2, 8), 3, 8) for name, mask in masks.items()}
-    term, there = begun(*at_truth(cut, replace(detections, **masks)), stage)
+    term, there = begun(*at_truth(cut, replace(detections, **masks)))
     of_first = [x.blocks.owner < 2 for x in (whole, term)]
     residuals = [
         x.linear(s.field, s.state, x.anchor(s)).residual[rows]
@@ -227,23 +202,3 @@ def test_what_images_change_is_differentiable(brightness: Brightness) -> None:
         numeric = (slopes(1e-6) - slopes(-1e-6)) / 2e-6
     assert abs(numeric) > 1e-3
     torch.testing.assert_close(slope, numeric, rtol=1e-3, atol=0)
-
-
-def test_cars_keep_their_rows_when_others_leave() -> None:
-    problem, state = at_truth(*drive())
-    term, prepared = begun(problem, state)
-    keep = torch.tensor([False, True, False, True, True, False])
-    cars = Chosen.where(keep)
-    numbers = list(cars.numbers)
-    fewer = term.of(cars)
-    blocks = keep[term.blocks.owner]
-    there = TrackState(*(x[numbers] for x in state))
-    anchor = type(term.anchor(prepared))(*(x[..., blocks, :] for x in term.anchor(prepared)))
-    field = field_of(problem.prior.bind(state.code))
-    residual = term.linear(field, state, term.anchor(prepared)).residual[blocks]
-    of_fewer = fewer.linear(field_of(problem.prior.bind(there.code)), there, anchor).residual
-    torch.testing.assert_close(of_fewer, residual, rtol=1e-9, atol=1e-9)
-    # Before a stage begins too.
-    whole = problem.evidence[0].of(cars)
-    assert isinstance(whole, NextViewEvidence)
-    assert whole.next_views.detection_row.tolist() == NEXT[numbers].tolist()

@@ -10,8 +10,8 @@ import pytest
 import torch
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.ground import cars_on
-from helpers.problems import DEFAULT
 from helpers.synthetic_scene import CAMERA_HEIGHT_M, cached_street, disturbed, joined_detections, joined_frames, street
+from helpers.track_drive import QUICK
 from torch import Tensor
 
 from directshape_torch.config import TracksConfig
@@ -133,7 +133,7 @@ def drive(time_s: Tensor | None, T_world_cam: Tensor | None = None) -> tuple[Fra
 def refined(
     time_s: Tensor | None, config: TracksConfig = CONFIG, T_world_cam: Tensor | None = None
 ) -> RefinementResult:
-    settings = replace(DEFAULT, tracks=config)
+    settings = replace(QUICK, tracks=config)
     result: RefinementResult = DirectShapeRefiner(ellipsoid_prior(), settings)(*drive(time_s, T_world_cam))
     return result
 

@@ -1,4 +1,4 @@
-"""These tests show that all views of a tracked car get one shape, and that cars without tracks stay unchanged."""
+"""Views of a tracked car get one shape, views that are not trusted get none, and other cars stay unchanged."""
 
 from __future__ import annotations
 
@@ -21,36 +21,35 @@ from helpers.synthetic_scene import (
     select,
     street,
 )
-from helpers.track_drive import assert_same, by_themselves, doubt, drive, of_tracks, refined
+from helpers.track_drive import QUICK, assert_same, by_themselves, doubt, drive, of_tracks, refined
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.errors import InputError
+from directshape_torch.refinement import refined as refinements
+from directshape_torch.refinement.problem import CarMinimum, CarProblem
 from directshape_torch.refinement.trust import EVIDENCE_NAMES
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
-from directshape_torch.state.unknowns import POSE
+from directshape_torch.solver.sharing import Groups
+from directshape_torch.state.unknowns import POSE, AnyState
 from directshape_torch.status import Status
 from directshape_torch.terms.priors import PriorTerm, height_prior
 from directshape_torch.tracks import same_car, share
 
 
-def test_tracks_of_one_view_are_cars_by_themselves_to_the_bit() -> None:
+def test_cars_beside_a_track_and_tracks_of_one_view_are_refined_as_by_themselves_to_the_bit() -> None:
     assert_same(of_tracks(4, -1, 9, -1, 2, -7), by_themselves())
-
-
-def test_cars_beside_a_track_are_refined_as_by_themselves_to_the_bit() -> None:
-    alone, mixed = by_themselves(), of_tracks(4, -1, 4, -1, 4, 3)
-    for row in (1, 3, 5):
-        assert torch.equal(mixed.T_cam_obj[row], alone.T_cam_obj[row])
-        assert torch.equal(mixed.code[row], alone.code[row])
+    alone, mixed = by_themselves(), of_tracks(7, 1, 7, 1, 7, -1)
+    assert torch.equal(mixed.T_cam_obj[5], alone.T_cam_obj[5])
+    assert torch.equal(mixed.code[5], alone.code[5])
 
 
 def test_views_of_a_track_get_one_shape_that_is_nearer_to_the_truth() -> None:
     _, detections, code = drive()
-    alone, together = by_themselves(), of_tracks(*[0, 1] * 3)
+    alone, together = (refined(detections, ids, config=DEFAULT) for ids in (None, [0, 1] * 3))
     assert together.status == [Status.converged] * 6
     for track in (0, 1):
         views = together.code[track::2]
@@ -74,29 +73,27 @@ def test_the_evidence_of_a_view_is_that_of_its_own_unknowns() -> None:
     frames, detections, _ = drive()
     timed = replace(frames, time_s=torch.tensor([0.0, 0.1, 0.2], dtype=torch.float64))
     track = replace(detections, track_id=torch.tensor([0, 1] * 3))
-    for result in (of_tracks(*[0, 1] * 3), DirectShapeRefiner(ellipsoid_prior(), DEFAULT)(timed, track)):
+    for result in (of_tracks(*[0, 1] * 3), DirectShapeRefiner(ellipsoid_prior(), QUICK)(timed, track)):
         assert result.track_part.tolist() == [0] * 6
         # Nobody said how good the detector is.
         unknown = [name for name, x in zip(EVIDENCE_NAMES, result.quality.evidence.mT, strict=True) if x.isnan().any()]
         assert unknown == ["log_detector_distance"]
 
 
-def test_a_batch_of_tracks_equals_a_loop() -> None:
+def test_a_batch_of_tracks_equals_a_loop_in_any_order() -> None:
     together = of_tracks(7, 1, 7, 1, 7, -1)
     for track_id, rows in (([3, -1, 3, -1, 3, -1], [0, 2, 4]), ([-1, 3, -1, 3, -1, -1], [1, 3])):
         one = of_tracks(*track_id)
         torch.testing.assert_close(together.T_cam_obj[rows], one.T_cam_obj[rows], rtol=0, atol=1e-9)
         torch.testing.assert_close(together.code[rows], one.code[rows], rtol=0, atol=1e-9)
-
-
-def test_the_order_of_the_detections_does_not_matter() -> None:
+    # The order of the detections does not matter either.
     _, detections, _ = drive()
     order, track_id = torch.tensor([4, 1, 0, 5, 3, 2]), [7, 1, 7, 1, 7, -1]
     shuffled = select(replace(detections, track_id=torch.tensor(track_id)), order)
     assert shuffled.track_id is not None
-    moved, result = refined(shuffled, shuffled.track_id.tolist()), of_tracks(*track_id)
-    torch.testing.assert_close(moved.T_cam_obj, result.T_cam_obj[order], rtol=0, atol=1e-9)
-    torch.testing.assert_close(moved.code, result.code[order], rtol=0, atol=1e-9)
+    moved = refined(shuffled, shuffled.track_id.tolist())
+    torch.testing.assert_close(moved.T_cam_obj, together.T_cam_obj[order], rtol=0, atol=1e-9)
+    torch.testing.assert_close(moved.code, together.code[order], rtol=0, atol=1e-9)
 
 
 def test_a_track_of_two_cars_is_split_where_they_were_swapped(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,7 +166,7 @@ def test_a_view_that_the_images_do_not_confirm_does_not_join() -> None:
         ("unroll", None, ""),
         pytest.param("unroll", None, "alone", marks=pytest.mark.long),
         pytest.param("unroll", (0, 0.1), "in_track", marks=pytest.mark.long),
-        ("implicit", None, "in_track"),
+        pytest.param("implicit", None, "in_track", marks=pytest.mark.long),
         ("implicit", (0, 0.1), "alone"),
         pytest.param("implicit_gauss_newton", None, "", marks=pytest.mark.long),
     ],
@@ -260,9 +257,77 @@ def test_a_term_of_ones_own_has_another_name_than_those_of_a_track() -> None:
         def user(*scene: Any) -> PriorTerm:
             return PriorTerm(name, 1.0, scene[2], height_prior, 1, (POSE,))
 
-        return DirectShapeRefiner(prior, DEFAULT, [user])
+        return DirectShapeRefiner(prior, QUICK, [user])
 
     assert named("user")(frames, detections).term_names[-1] == "user"
     for name in ("path", "acceleration", "next_view"):
         with pytest.raises(InputError, match=f"extra term '{name}': names: expected names that no column of a track"):
             named(name)(frames, detections)
+
+
+def test_a_view_that_is_not_trusted_alone_is_where_its_track_makes_it_trusted(monkeypatch: pytest.MonkeyPatch) -> None:
+    together = of_tracks(*[0, 1] * 3)
+    doubt(monkeypatch, alone=2)
+    assert refined(drive()[1]).status[2] == Status.not_trusted
+    assert_same(refined(drive()[1], [0, 1] * 3), together)
+
+
+@pytest.mark.parametrize("in_track", [(2,), (0, 4)])
+def test_a_view_that_is_not_trusted_in_good_company_leaves_the_track_as_without_it(
+    monkeypatch: pytest.MonkeyPatch, in_track: tuple[int, ...]
+) -> None:
+    """It is not trusted in its track, or alone is."""
+    _, detections, _ = drive()
+    without = of_tracks(0, 1, -1, 1, 0, 1)
+    doubt(monkeypatch, *in_track, alone=2)
+    result = refined(detections, [0, 1] * 3)
+    assert result.status[2] == Status.not_trusted
+    assert torch.equal(result.T_cam_obj[2], detections.T_cam_obj[2])
+    others = [0, 1, 3, 4, 5]
+    for name in ("T_cam_obj", "code", "covariance", "cost_after"):
+        assert torch.equal(getattr(result, name)[others], getattr(without, name)[others]), name
+
+
+def test_a_view_that_is_not_trusted_alone_splits_no_track(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(same_car, "_MOST_EVIDENCE", 3.0)
+    _, detections, _ = drive(contrast=2.5)
+    doubt(monkeypatch, alone=4)
+    assert refined(detections, [0, 1, 0, 1, 1, 0], contrast=2.5).track_part.tolist() == [0, 0, 0, 0, 0, -1]
+
+
+def test_a_view_that_is_not_trusted_in_its_track_keeps_what_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, detections, _ = drive()
+    alone, trusted = by_themselves(), of_tracks(*[0, 1] * 3)
+    doubt(monkeypatch, 2)
+    result = refined(detections, [0, 1] * 3)
+    others = [0, 1, 3, 4, 5]
+    for name, values in result.state_dict().items():
+        if name in ("T_cam_obj", "code", "covariance", "cost_after", "quality.mask_iou_left"):
+            # A track has columns of costs more.
+            own = values[2, : len(alone.term_names)] if name == "cost_after" else values[2]
+            assert torch.equal(own, alone.state_dict()[name][2]), name
+            assert torch.equal(values[others], trusted.state_dict()[name][others]), name
+    assert all(status.is_refined for status in result.status)
+
+
+def test_a_view_that_leaves_midway_leaves_the_track_as_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, detections, _ = drive()
+    without = of_tracks(0, 1, -1, 1, 0, 1)
+    minimise = refinements.minimise
+
+    def failing(problem: CarProblem, *others: Any) -> CarMinimum[AnyState]:
+        minimum = minimise(problem, *others)
+        if not isinstance(problem.sharing, Groups) or len(minimum.status) < 6:
+            return minimum
+        return replace(minimum, status=minimum.status.index_fill(0, torch.tensor([2]), Status.singular.code))
+
+    monkeypatch.setattr(refinements, "minimise", failing)
+    assert_same(refined(detections, [0, 1] * 3), without)
+
+
+def test_a_view_whose_track_has_no_other_that_is_trusted_has_a_shape_of_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    _, detections, _ = drive()
+    doubt(monkeypatch, 1, num_rows=4)
+    assert refined(detections, [0, -1, 0, 1, -1, 1]).track_part.tolist() == [-1, -1, -1, 0, -1, 0]
