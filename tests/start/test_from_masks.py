@@ -74,8 +74,8 @@ def test_the_result_does_not_depend_on_the_other_masks() -> None:
 
 def test_frames_are_matched_where_they_have_no_disparity() -> None:
     found = started(frames=replace(demo().frame, disparity=None))
-    # A few disparities of parts of images differ from those of whole images.
-    torch.testing.assert_close(found.T_cam_obj, started().T_cam_obj, rtol=0, atol=0.05)
+    # Parts of images have other disparities than whole images, by a few or, near the camera, by part of a pixel.
+    torch.testing.assert_close(found.T_cam_obj, started().T_cam_obj, rtol=0, atol=0.1)
 
 
 def test_a_disparity_field_moves_the_boxes() -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 from helpers.synthetic_scene import cached_street, joined_frames, measured_street
 
+from directshape_torch import FrameBatch, StereoCamera
 from directshape_torch.stereo_matching.disparity import with_disparity
 
 
@@ -94,3 +96,28 @@ def test_parts_are_matched_together_where_that_is_less_work() -> None:
         together = with_disparity(frames, torch.tensor([0, 0]), extents).disparity
         reversed_order = with_disparity(frames, torch.tensor([0, 0]), extents.flip(0)).disparity
         torch.testing.assert_close(together, reversed_order, rtol=0, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("u0", [230, 231])
+def test_a_near_part_is_matched_in_half_of_the_size_beside_a_far_one(u0: int) -> None:
+    """A wall stands at 30 px of disparity, and before it a thing at 60 px."""
+    generator = torch.Generator().manual_seed(0)
+    wall, thing = torch.rand(3, 401, 701, generator=generator), torch.rand(3, 221, 201, generator=generator)
+    left, right = wall.clone(), wall.roll(-30, dims=2)
+    left[:, 100:321, 200:401], right[:, 100:321, 140:341] = thing, thing
+    camera = StereoCamera.from_intrinsics([[700.0, 0, 350], [0, 700, 200], [0, 0, 1]], 0.53)
+    frames = FrameBatch.from_images(left[None], right[None], camera)
+    extents = torch.tensor([[u0, 110, 390, 311], [450, 150, 520, 190]])
+    found = with_disparity(frames, torch.tensor([0, 0]), extents).disparity
+    assert found is not None
+    for part, expected, limit in (((110, 311, 240, 390), 60.0, 0.6), ((150, 190, 450, 520), 30.0, 0.1)):
+        v0, v1, a, b = part
+        error = found[0, v0:v1, a:b] - expected
+        assert error.isfinite().double().mean() > 0.9
+        assert error[error.isfinite()].abs().quantile(0.9) < limit
+    # The part of the far thing, which does not reach so near, leaves what is known of the near one.
+    overlap = torch.tensor([[u0, 110, 390, 311], [380, 150, 430, 190]])
+    both = with_disparity(frames, torch.tensor([0, 0]), overlap).disparity
+    assert both is not None
+    near = both[0, 155:185, 370:390]
+    assert ((near - 60).abs() < 1).double().mean() > 0.8
