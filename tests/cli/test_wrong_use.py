@@ -73,6 +73,8 @@ CASES = [
     ("report {run} --html {root}", "--html: expected a file, got the folder"),
     (f"{MASKED} --prior pcaa", "directshape build-prior; bundled ones are pca and neural"),
     (f"{MASKED} --threads 0", "threads: expected at least 1, got 0"),
+    (f"{MASKED} --batch-frames 0", "batch_frames: expected at least 1, got 0"),
+    (MASKED.replace("{out}", "s3://bucket/out"), "expected a folder of a file system, got s3:/bucket/out; mount it"),
     (f"{MASKED} --lidar nowhere", "nowhere: is no folder of LiDAR scans"),
     (
         f"{MASKED} --disparity x",

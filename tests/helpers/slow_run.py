@@ -1,4 +1,4 @@
-"""This program runs slow workers for a test that kills it, two of them or those of Ray: slow_run.py ROOT OUT [RAY]."""
+"""This program runs slow workers for a test that kills it: slow_run.py ROOT OUT [NUMBER OF WORKERS | RAY]."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from directshape_torch.io.stereo_dataset import open_dataset
 from helpers.quick_runs import SlowRefiner
 
 
-def main(root: Path, out_dir: Path, ray: str | None = None) -> None:
+def main(root: Path, out_dir: Path, engine: str = "2") -> None:
     dataset = open_dataset("kitti", root, root / "detections", root / "masks")
-    refine_dataset(dataset, SlowRefiner(root), out_dir, RefineOptions(workers=2 if ray is None else None, ray=ray))
+    options = RefineOptions(workers=int(engine)) if engine.isdecimal() else RefineOptions(ray=engine)
+    refine_dataset(dataset, SlowRefiner(root), out_dir, options)
 
 
 if __name__ == "__main__":

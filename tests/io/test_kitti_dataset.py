@@ -185,6 +185,7 @@ def cut(path: Path) -> None:
         (lambda root: (root / "training/image_2/000000.png").unlink(), r"image_2/000000\.png: cannot be read"),
         (lambda root: (root / "training/calib/000000.txt").write_text("P2: 1\n"), r"calib/000000\.txt, line 1: exp"),
         (lambda root: cut(root / "detections/data/000000.txt"), r"000000\.txt, line 1: expected 15 or 16 columns"),
+        (lambda root: cut(root / "training/label_2/000000.txt"), r"label_2/000000\.txt, line 1: expected 15 columns"),
         (lambda root: (root / "masks/000000.json").unlink(), r"masks/000000\.json: cannot be read"),
         (
             lambda root: write_png(root / "training/image_3/000000.png", np.zeros((120, 100, 3), np.uint8)),
