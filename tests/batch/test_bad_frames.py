@@ -103,8 +103,12 @@ def test_a_full_disk_stops_the_run_and_the_next_goes_on(
         def finished(self, frame_id: str, failure: str | None) -> None:
             monkeypatch.setattr("directshape_torch.batch.group_refinement.write_frame_outputs", full)
 
+    out = tmp_path / "out"
     with pytest.raises(DirectShapeError, match=r"cannot write to .*No space left.*run the same command again"):
-        refine(shared_kitti, tmp_path, observer=Filler())
+        refine(shared_kitti, out, observer=Filler())
     monkeypatch.undo()
-    summary = refine(shared_kitti, tmp_path)
+    assert not list(out.rglob("*.tmp"))
+    summary = refine(shared_kitti, out)
     assert (summary.resumed, summary.exit_code) == (FRAMES[:1], 0)
+    refine(shared_kitti, tmp_path / "whole")
+    assert result_files(out) == result_files(tmp_path / "whole")
