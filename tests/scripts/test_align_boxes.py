@@ -14,12 +14,14 @@ from helpers.synthetic_scene import TWO_CARS, Street, joined_detections, joined_
 from reference.rays import RaysObj
 
 from directshape_torch.geometry import se3
+from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rows import Rays
 from directshape_torch.scene.detections import Detections
 from directshape_torch.scene.frames import FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.state.cars import CarState
 
 
 @lru_cache
@@ -44,6 +46,19 @@ def moved(detections: Detections, *factors: float) -> Detections:
     T_cam_obj = detections.T_cam_obj.clone()
     T_cam_obj[:, :3, 3] *= torch.tensor(factors, dtype=T_cam_obj.dtype)[:, None]
     return replace(detections, T_cam_obj=T_cam_obj)
+
+
+def test_disparity_moves_the_origin_along_its_viewing_ray() -> None:
+    before = pose_from_kitti(
+        torch.tensor([[2.0, 1.6, 20.0], [-4.0, 1.7, 35.0]]).double(), torch.tensor([0.4, -2.0]).double()
+    )
+    state = CarState.of(se3.inverse(before), torch.zeros(2, 3).double())
+    focal_baseline = torch.tensor([380.0, 380.0]).double()
+    after = se3.inverse(script.move_by_disparity(state, focal_baseline, 1.5).T_obj_cam)
+    torch.testing.assert_close(380 / after[:, 2, 3], 380 / before[:, 2, 3] + 1.5)
+    ratio = after[:, :3, 3] / before[:, :3, 3]
+    torch.testing.assert_close(ratio, ratio[:, :1].expand(2, 3))
+    torch.testing.assert_close(after[:, :3, :3], before[:, :3, :3])
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
