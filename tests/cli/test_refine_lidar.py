@@ -53,19 +53,15 @@ def refine(root: Path, out: Path, *extra: object) -> int:
     return main(command(root, out, *map(str, extra)))
 
 
-def test_the_results_and_the_manifest_know_the_scans(source: Path, tmp_path: Path) -> None:
-    assert refine(source, tmp_path, "--lidar", source / "velodyne") == 0
-    assert "lidar" in read_shapes(tmp_path / "shapes" / "000000.npz").term_names
-    assert "lidar" in RunFolder(tmp_path).read("000001").record.inputs
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["config"]["extra_terms"] == ["LidarPoints(weight=300.0, huber_m=0.1)"]
-
-
-def test_other_scans_or_none_are_no_resumption(
+def test_a_run_knows_its_scans_and_does_not_go_on_with_others(
     source: Path, scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
     assert refine(source, out, "--lidar", scans) == 0
+    assert "lidar" in read_shapes(out / "shapes" / "000000.npz").term_names
+    assert "lidar" in RunFolder(out).read("000001").record.inputs
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["config"]["extra_terms"] == ["LidarPoints(weight=300.0, huber_m=0.1)"]
     write_scan(scans / "000001.bin", np.ones((20, 3)))
     assert refine(source, out, "--lidar", scans) == 2
     assert "cannot resume: frame 000001: sha256 of 'lidar' was" in capsys.readouterr().err

@@ -85,7 +85,10 @@ CASES = [
         "check-data --data {root} --detections {root}/detections --masks {root}/masks --frames 77",
         "such as 000000, got 77",
     ),
-    ("evaluate --labels {root}/training/label_2 --results {root}/training/label_2", "a result without score"),
+    (
+        "evaluate --labels {root}/training/label_2 --results {root}/training/label_2",
+        "000000.txt, line 1: a result without score: ",
+    ),
     (f"compare --labels {DEMO_FOLDER}/training/label_2 --after nowhere", "nowhere: is no folder of result files"),
     (f"{DEMO_MASKS.replace('calibrate-rig', 'refine')} --classes Van --out {{out}}", "classes: expected Car"),
     (f"{DEMO_MASKS} --out {{out}}/a.json", "--detections: expected boxes of a detector, got none; --from detections"),

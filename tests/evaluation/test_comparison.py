@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -256,16 +255,6 @@ def test_results_without_boxes_before_are_measured_alone(folders: tuple[Path, Pa
     content = json.loads((tmp_path / "all.json").read_text())
     assert content["overall"]["metrics"]["centre_m_median"]["before"] is None
     assert "->" not in format_comparison(found)
-
-
-@pytest.mark.skipif("DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA is not set: rendered frames needed")
-@pytest.mark.parametrize(("detector", "bev_iou"), [("stereo", 0.722), ("mono", 0.487), ("gt", 1.0)])
-def test_simulated_detectors(detector: str, bev_iou: float):
-    root = Path(os.environ["DIRECTSHAPE_DATA"]) / "rendered"
-    folder = root / "detections" / detector
-    overall = compare_results(root / "training" / "label_2", folder, folder).overall
-    assert overall.metrics["bev_iou_mean"].after.value == pytest.approx(bev_iou, abs=2e-3)
-    assert overall.num_detections == (102 if detector == "gt" else 97)
 
 
 @pytest.mark.parametrize("named", ["", "frames"])

@@ -11,7 +11,7 @@ from helpers.kitti_folder import write_disparity
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_png
-from directshape_torch.io.image_files import find_image, read_disparity, read_pair, read_rgb, read_single_channel
+from directshape_torch.io.image_files import find_image, read_disparity, read_pair, read_rgb
 
 
 @pytest.fixture
@@ -65,11 +65,6 @@ def test_images_of_16_bits_may_hold_fewer(tmp_path: Path, bits: int) -> None:
     for image, stored in zip(found, (left, right), strict=True):
         assert image.dtype == np.uint8
         np.testing.assert_allclose(image, stored * (255 / (2**bits - 1)), atol=0.501)
-
-
-def test_colour_image_where_ids_are_expected(png: Path) -> None:
-    with pytest.raises(DataFormatError, match=r"expected one channel, got an image of shape \(20, 30, 3\)"):
-        read_single_channel(png)
 
 
 def test_round_trip_to_a_256th_of_a_pixel(tmp_path: Path) -> None:

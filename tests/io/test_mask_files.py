@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import write_png
-from directshape_torch.io.instance_masks import InstanceMask, decode_segmentation
+from directshape_torch.io.instance_masks import decode_segmentation
 from directshape_torch.io.mask_files import CocoFileMasks, FrameJsonMasks, InstancePngMasks, mask_source
 
 SIZE_HW = (6, 9)
@@ -203,14 +203,6 @@ def test_a_street_without_instances_shows_no_car(tmp_path: Path, numbers: tuple[
         ids[row] = number
     write_png(tmp_path / "instance_2" / "000000.png", ids)
     assert sum(mask.is_car for mask in mask_source(tmp_path).read("000000", SIZE_HW)) == cars
-
-
-def test_an_instance_keeps_no_more_than_its_part_of_the_image() -> None:
-    image = np.where(MASK, np.float32(0.7), np.float32(0))
-    mask = InstanceMask.found("left", 1, True, image)
-    assert mask is not None
-    assert mask.probability.shape < SIZE_HW
-    assert not np.shares_memory(mask.probability, image)
 
 
 def test_instance_png_of_8_bits_is_refused_and_an_empty_one_is_not(tmp_path: Path) -> None:
