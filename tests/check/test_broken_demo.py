@@ -88,10 +88,7 @@ BREAKS: dict[str, tuple[Break, str]] = {
     "box centre for bottom": (boxes(centre), "box_origin"),
     "2D boxes as x y width height": (boxes(corner_and_size), "box_2d"),
     "classes in lower case": (text(BOXES, str.lower), "no_cars"),
-    "masks of another category": (
-        text(MASKS, lambda t: t.replace('"category_id": 3', '"category_id": 1')),
-        "no_masks",
-    ),
+    "masks of another category": (text(MASKS, lambda t: t.replace('"category_id": 3', '"category_id": 1')), "no_masks"),
     "right image a negative": (image(lambda pixels: 255 - pixels, RIGHT), "grey_levels"),
     "missing right image": (lambda root: (root / RIGHT).unlink(), "missing_files"),
     "missing masks": (lambda root: (root / MASKS).unlink(), "missing_files"),

@@ -76,8 +76,7 @@ def test_correct_frames_raise_no_alarm(data: str, detections: str, masks: str) -
 
 @needs_data
 @pytest.mark.parametrize(
-    ("data", "detections"),
-    [("kitti15", "noisy_stereo"), pytest.param("rendered", "stereo", marks=pytest.mark.long)],
+    ("data", "detections"), [("kitti15", "noisy_stereo"), pytest.param("rendered", "stereo", marks=pytest.mark.long)]
 )
 @pytest.mark.parametrize(
     "name", ["heading in degrees", "heading off by 180 degrees", "focal length 0.8 times too short"]

@@ -57,11 +57,7 @@ def test_the_version_is_that_of_the_program(capsys: pytest.CaptureFixture[str]) 
     ],
 )
 def test_an_error_is_one_line_and_an_exit_code(
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    error: BaseException,
-    code: int,
-    said: str,
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int, said: str
 ) -> None:
     def fail(_: object) -> int:
         raise error

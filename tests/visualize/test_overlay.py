@@ -12,14 +12,7 @@ from helpers.bundled_frame import BOXES, DEMO, MASKS
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.synthetic_scene import cached_street, disturbed, joined_frames
 
-from directshape_torch import (
-    Detections,
-    DirectShapeRefiner,
-    FrameBatch,
-    InputError,
-    RefinementResult,
-    load_config,
-)
+from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, InputError, RefinementResult, load_config
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.status import Status
