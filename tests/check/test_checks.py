@@ -298,17 +298,13 @@ def test_a_field_that_the_cars_contradict(bias_px: float, expected: list[str], m
 DATA = os.environ.get("DIRECTSHAPE_DATA")
 
 
+@pytest.mark.long
 @pytest.mark.skipif(DATA is None, reason="DIRECTSHAPE_DATA is not set")
 @pytest.mark.parametrize(
     ("layout", "root", "detections", "masks"),
     [
-        *(
-            pytest.param("kitti", root, f"{root}/detections/{boxes}", f"{root}/{masks}", marks=pytest.mark.long)
-            for root, boxes, masks in (
-                ("rendered", "mono", "masks_degraded"),
-                ("kitti", "noisy_stereo", "training/masks"),
-            )
-        ),
+        ("kitti", "rendered", "rendered/detections/mono", "rendered/masks_degraded"),
+        ("kitti", "kitti", "kitti/detections/noisy_stereo", "kitti/training/masks"),
         ("tracking", "kitti/tracking/0005", "kitti/tracking/0005/detections/pointrcnn", "kitti/tracking/0005"),
     ],
 )

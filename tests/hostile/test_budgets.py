@@ -80,7 +80,10 @@ def test_images(tmp_path: Path, content: bytes) -> None:
 def archive(compression: int = zipfile.ZIP_DEFLATED, encrypted: bool = False, zeros: int = 100) -> bytes:
     """An npz of zeros."""
     content = io.BytesIO()
-    with zipfile.ZipFile(content, "w", compression) as file, file.open("a.npy", "w", force_zip64=True) as entry:
+    with (
+        zipfile.ZipFile(content, "w", compression, compresslevel=1) as file,
+        file.open("a.npy", "w", force_zip64=True) as entry,
+    ):
         np.lib.format.write_array_header_1_0(entry, {"descr": "|u1", "fortran_order": False, "shape": (zeros,)})
         for start in range(0, zeros, 2**24):
             entry.write(bytes(min(2**24, zeros - start)))

@@ -134,7 +134,7 @@ def test_a_run_that_is_asked_to_end_says_so(tmp_path: Path) -> None:
     write_data_set(root, tuple(f"{number:06d}" for number in range(16)))
     command = [sys.executable, "-m", "directshape_torch", "refine", "--data", str(root), "--out", str(out)]
     command += ["--detections", str(root / "detections"), "--masks", str(root / "masks")]
-    command += ["--prior", str(root / "prior.safetensors"), "--rig", "none", "--threads", "1"]
+    command += ["--prior", str(root / "prior.safetensors"), "--rig", "none", "--set", "check=off", "--threads", "1"]
     package = str(Path(directshape_torch.__file__).parent.parent)
     run = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": package}, stderr=subprocess.PIPE, text=True)
     try:
