@@ -140,7 +140,6 @@ def test_the_run_is_refused_in_the_same_words(
 
 
 def test_points_of_a_call(demo: tuple[Path, Points], tmp_path: Path) -> None:
-    """Tensors of the left camera, and those that were left in the axes of a LiDAR."""
     root, points = demo
     frames, detections = collate([with_scan(root, tmp_path, points).load("000000")])
     assert check_scene(frames, detections, match_images=False).findings == ()

@@ -100,7 +100,6 @@ def test_the_refiner_warns_as_often_as_it_is_told() -> None:
 
 
 def test_hopeless_tensors_are_checked_without_errors() -> None:
-    """Numbers that are not finite, images of nothing, cars behind the camera and none at all."""
     frames, detections = demo()
     black = replace(frames, images_left=torch.full_like(frames.images_left, torch.nan), images_right=frames.images_left)
     T = detections.T_cam_obj.clone()

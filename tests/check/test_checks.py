@@ -128,7 +128,6 @@ def test_distances_tell_the_baseline_from_the_boxes() -> None:
 
 
 def test_a_damaged_frame_of_a_folder_is_one_finding_and_hides_no_other(kitti: Path, tmp_path: Path) -> None:
-    """Its file holds detections, masks and plane."""
     write_folder(kitti, tmp_path, ("000000", "000001"))
     path = tmp_path / "frames" / "000001.json"
     path.write_text(path.read_text()[:300])
@@ -219,7 +218,6 @@ def test_a_plain_folder_is_spoken_of_by_its_own_keys(
 
 
 def test_every_kind_of_mistake_has_words_in_every_source() -> None:
-    """A finding is made without a word missing, of any convention and of any layout."""
     sources = [
         *map(words_of_tensors, get_args(BoxFormat)),
         words_of_files(Path("calib.txt"), ("P_rect_02", "P_rect_03")),

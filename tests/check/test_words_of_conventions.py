@@ -125,7 +125,6 @@ def test_a_mistake_is_named_in_the_words_of_the_convention(convention: BoxFormat
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_axes_of_another_frame(convention: BoxFormat) -> None:
-    """Boxes of a camera for those of a LiDAR, and the other way round."""
     frames, cars = demo()
     source: BoxFormat = "openpcdet" if convention not in LIDAR else "opencv"
     boxes = poses_to_boxes(cars.T_cam_obj, cars.dimensions_hwl, source, LIDAR.get(source))

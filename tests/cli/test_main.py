@@ -69,7 +69,6 @@ def test_an_error_is_one_line_and_an_exit_code(
 
 
 def test_the_package_is_the_program_and_help_loads_only_what_it_needs() -> None:
-    """Not what only some commands need, or nobody has installed."""
     script = (
         "import runpy, sys, directshape_torch\nbefore, sys.argv = set(sys.modules), ['directshape', '--help']\n"
         "try: runpy.run_module('directshape_torch', run_name='__main__')\n"

@@ -157,7 +157,6 @@ def test_empty_files_and_no_files(tmp_path: Path):
 
 
 def test_files_of_the_tracking_benchmark(folders: tuple[Path, Path, Path], tmp_path: Path):
-    """One file a sequence, or that file itself, with the figures of a file a frame."""
     expected = [(car.before, car.after) for car in compare_results(*folders).cars]
     sequences = []
     for folder in (folders[0], folders[1] / "data"):
@@ -211,7 +210,6 @@ def test_a_file_in_the_folder_of_its_sequence_is_one_of_a_frame(tmp_path: Path, 
 
 
 def test_a_split_of_drives_serves_the_evaluation(tmp_path: Path) -> None:
-    """Which drive its files are of, nobody says there."""
     (tmp_path / "split.txt").write_text("2011_09_26/2011_09_26_drive_0005_sync 0000000007 l\n")
     assert chosen_frames(["0000000005", "0000000007"], None, tmp_path / "split.txt", "frames") == ["0000000007"]
 

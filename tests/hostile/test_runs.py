@@ -41,7 +41,7 @@ def undisturbed(shared_kitti: Path, tmp_path_factory: pytest.TempPathFactory) ->
 def test_a_worker_that_is_killed_as_it_starts(
     shared_kitti: Path, tmp_path: Path, undisturbed: Path, delay_s: float
 ) -> None:
-    """Before they have read the job, which is larger than a pipe holds."""
+    """The worker dies before it has read the job, which is larger than a pipe holds."""
     killed: list[int] = []
 
     def kill() -> None:

@@ -117,7 +117,6 @@ def test_soft_probability_replaces_the_binary_mask(tmp_path: Path) -> None:
     "nothing", [{"size": [6, 9], "counts": [54]}, [], [[]], None, [[1, 1, 3, 3]], [[1, 1, 3, 3, 5]], [[], [2, 2]]]
 )
 def test_an_empty_mask_is_no_instance_and_harms_no_other(tmp_path: Path, nothing: Any) -> None:
-    """Tools write such entries for what has no area."""
     write_json(tmp_path / "000000.json", [entry(image="left", segmentation=nothing), entry(image="left")])
     (mask,) = FrameJsonMasks(tmp_path).read("000000", SIZE_HW)
     assert mask.mask_box == (4, 1, 5, 3)

@@ -116,7 +116,6 @@ def test_tracking_benchmark_with_one_result_file_a_sequence(
 
 
 def test_tracking_frames_called_by_sequence_in_one_folder(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
-    """As a refinement writes its results, which may be refined again."""
     write_sequence(kitti, tmp_path, FRAMES, single=False)
     detections, masks = renamed(kitti, tmp_path, (f"{SEQUENCE}_000000", f"{SEQUENCE}_000001"))
     dataset = open_dataset("tracking", tmp_path, detections, masks, dtype=torch.float64)
@@ -128,7 +127,6 @@ def test_tracking_frames_called_by_sequence_in_one_folder(kitti: Path, tmp_path:
 
 @pytest.mark.parametrize("where", ["testing", "training/../testing", "."])
 def test_the_object_benchmark_without_a_training_folder(kitti_copy: Path, expected: LoadedFrame, where: str) -> None:
-    """The folder `testing`, alone below the root or named by itself."""
     (kitti_copy / "training").rename(kitti_copy / "testing")
     (kitti_copy / "training").mkdir()
     root = kitti_copy / where
@@ -248,7 +246,6 @@ def test_folder(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
 
 
 def test_a_mask_stays_with_its_object_wherever_it_is(kitti: Path, tmp_path: Path) -> None:
-    """Two objects with each other's masks: overlap would set that right, the file is believed."""
     write_folder(kitti, tmp_path, FRAMES)
     path = tmp_path / "frames" / "000000.json"
     content = json.loads(path.read_text())
