@@ -1,9 +1,8 @@
-"""This module keeps what matching two images gives: matching is slow, and most tests do not change the images."""
+"""Tests of checks match equal images once: matching is slow, and most of these tests do not change the images."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -24,10 +23,12 @@ def _remembered(match: Callable[..., Any]) -> Callable[..., Any]:
     return answered
 
 
-@contextmanager
-def matched_once() -> Iterator[None]:
-    """The checks of scenes match equal images once while the body runs."""
+_PAIR, _DISPARITY = _remembered(check_images.match_pair), _remembered(check_lidar.match_disparity)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _match_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(check_images, "match_pair", _remembered(check_images.match_pair))
-        patch.setattr(check_lidar, "match_disparity", _remembered(check_lidar.match_disparity))
+        patch.setattr(check_images, "match_pair", _PAIR)
+        patch.setattr(check_lidar, "match_disparity", _DISPARITY)
         yield
