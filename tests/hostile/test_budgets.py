@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from directshape_torch.errors import ConfigError, DataFormatError, DirectShapeError
@@ -127,8 +128,6 @@ def test_archives(tmp_path: Path, made: dict[str, Any], problem: str) -> None:
     ids=str,
 )
 def test_networks(tmp_path: Path, changes: dict[str, Any]) -> None:
-    from safetensors import safe_open
-
     asset, path = Path(priors.__file__).parents[1] / "assets" / "neural_prior.safetensors", tmp_path / "a.safetensors"
     with safe_open(asset, framework="pt") as file:
         description = {**json.loads(file.metadata()["description"]), **changes}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -86,6 +87,7 @@ def test_far_truth_is_left_out_of_the_scale() -> None:
     np.testing.assert_array_equal(with_far[150:], plain[150:])
 
 
+@cache
 def call_of_two_frames() -> tuple[FrameBatch, Detections, RefinementResult]:
     """The street twice, its second car in the second frame; the first frame has no masks and is not refined."""
     prior, street = cached_street()
