@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.bundled_frame import DEMO
+from helpers.matched_once import matched_once
 
 from directshape_torch.check.check_dataset import check_dataset
 from directshape_torch.check.finding import CheckReport
@@ -21,6 +22,12 @@ Break = Callable[[Path], object]  # changes the files below a root with `trainin
 # Folders and files of the one frame.
 LEFT, RIGHT, CALIBRATION = "training/image_2/000000.png", "training/image_3/000000.png", "training/calib/000000.txt"
 BOXES, MASKS, PLANE = "detections/data/000000.txt", "training/masks/000000.json", "training/planes/000000.txt"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def match_once() -> Iterator[None]:
+    with matched_once():
+        yield
 
 
 def report_of(root: Path, broken: Break) -> CheckReport:

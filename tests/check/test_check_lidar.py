@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.bundled_frame import BOXES, DEMO
+from helpers.matched_once import matched_once
 from numpy.typing import NDArray
 
 from directshape_torch import check_scene
@@ -25,6 +26,12 @@ from directshape_torch.stereo_matching.disparity import match_disparity
 
 PLACE = "R0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: 0 -1 0 0.05 0 0 -1 -0.1 1 0 0 -0.3\n"
 Points = NDArray[np.float32]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def match_once() -> Iterator[None]:
+    with matched_once():
+        yield
 
 
 @pytest.fixture(scope="module")

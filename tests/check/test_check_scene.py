@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.bundled_frame import BOXES, DEMO, MASKS
+from helpers.matched_once import matched_once
 from scene_mistakes import MISTAKES, Scene, answer, named, scene
 
 from directshape_torch import DirectShapeRefiner, check_scene, load_config
@@ -35,6 +37,12 @@ def demo() -> Scene:
 def eight_frames(data: str, detections: str) -> Scene:
     root = Path(str(DATA)) / data
     return scene(root, root / "detections" / detections, root / "training" / "masks", 8)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def match_once() -> Iterator[None]:
+    with matched_once():
+        yield
 
 
 def test_the_bundled_frame_is_correct() -> None:

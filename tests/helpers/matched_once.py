@@ -1,8 +1,9 @@
-"""Tests of checks match equal images once: matching is slow, and most of these tests do not change the images."""
+"""This module keeps what matching two images gives: matching is slow, and most tests do not change the images."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -23,12 +24,13 @@ def _remembered(match: Callable[..., Any]) -> Callable[..., Any]:
     return answered
 
 
-_PAIR, _DISPARITY = _remembered(check_images.match_pair), _remembered(check_lidar.match_disparity)
+_match_pair, _match_disparity = _remembered(check_images.match_pair), _remembered(check_lidar.match_disparity)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _match_once() -> Iterator[None]:
+@contextmanager
+def matched_once() -> Iterator[None]:
+    """The checks of scenes match equal images once while the body runs, and not again in a later body."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(check_images, "match_pair", _PAIR)
-        patch.setattr(check_lidar, "match_disparity", _DISPARITY)
+        patch.setattr(check_images, "match_pair", _match_pair)
+        patch.setattr(check_lidar, "match_disparity", _match_disparity)
         yield
