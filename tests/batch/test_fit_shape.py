@@ -163,6 +163,16 @@ def test_scans_of_a_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         assert arrays["input_lines"].tolist() == [2, 3]
 
 
+def test_boxes_of_a_fitted_scan_are_those_of_its_result_lines(tmp_path: Path) -> None:
+    root, boxes = scanned_dataset(tmp_path)
+    dataset = open_dataset("kitti", root, boxes, frames=[3], lidar_dir=root / "velodyne")
+    fit = fit_scan(dataset, "000003", str(tmp_path / "out"))
+    lines = read_objects(tmp_path / "out" / "data" / "000003.txt")[1:]
+    written = torch.tensor([line.location_ref for line in lines])
+    assert torch.allclose(fit.cars.boxes().location_ref.float(), written, atol=0.006)
+    assert fit.cars.t_cam_ref[0, 0] == pytest.approx(40 / 700)
+
+
 def test_frames_need_their_scans(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root, boxes = scanned_dataset(tmp_path)
     words = ["fit-shape", "--data", str(root), "--lidar", str(boxes), "--boxes", str(boxes)]

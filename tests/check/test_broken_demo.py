@@ -122,8 +122,9 @@ def test_a_file_without_2d_boxes_is_right_and_said_to_be_so(tmp_path: Path) -> N
     assert report.exit_code == 0
 
 
-def test_refine_says_what_check_data_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    broken, check = BREAKS["box centre for bottom"]
+@pytest.mark.parametrize("name", ["right image a negative", "box centre for bottom"])
+def test_refine_says_what_check_data_says(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    broken, check = BREAKS[name]
     said = {str(finding) for finding in report_of(tmp_path / "data", broken).findings if finding.check == check}
     root = tmp_path / "data"
     names = ["--data", root, "--detections", root / "detections", "--masks", root / "training" / "masks"]

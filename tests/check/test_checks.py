@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -74,6 +75,13 @@ def matches(
 def test_pairs(pair: PairMatches, expected: list[tuple[str, str]]) -> None:
     found = check_pair(pair, None, SIZE_HW, "frame 1")
     assert [(finding.check, finding.severity) for finding in found] == expected
+
+
+def test_a_turned_camera_is_told_from_one_that_is_tilted() -> None:
+    (finding,) = check_pair(matches(across=3.0), None, SIZE_HW, "frame 1")
+    found = re.findall(r"([-+][0-9.]+) px more from (left|top)", finding.measured)
+    slopes = {edge: float(number) for number, edge in found}
+    assert slopes == {"left": pytest.approx(3.0, abs=0.3), "top": pytest.approx(0.0, abs=0.3)}
 
 
 def test_errors_come_first_and_files_say_their_own_cure() -> None:

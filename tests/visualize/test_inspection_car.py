@@ -81,6 +81,13 @@ def test_photometric_residuals_fall_and_hardly_a_pixel_is_lost(course: CarCourse
     assert course.loaded.detections.mask_left.dense()[_CAR].numpy()[v, u].mean() > 0.9
 
 
+def test_costs_end_at_those_of_the_result(course: CarCourse) -> None:
+    costs, result = course.costs, course.trace.result
+    assert costs["sum"][0] == pytest.approx(float(result.cost_before[_CAR].sum()), rel=1e-9)
+    assert costs["sum"][-1] == pytest.approx(float(result.cost_after[_CAR].sum()), rel=2e-4)
+    assert set(costs) == {*result.term_names, "sum"}
+
+
 def test_animation_moves_the_contour_in_both_images(course: CarCourse) -> None:
     frames = iteration_frames(course)
     assert len(frames) == len(course.steps)

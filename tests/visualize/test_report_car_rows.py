@@ -40,6 +40,11 @@ def test_what_is_not_known_is_none() -> None:
     assert hidden["iou_after"] == pytest.approx(1)
 
 
+def test_status_of_a_later_version_is_no_refined_one() -> None:
+    (row,) = car_rows(0, result(car(1, 100), statuses=("wondrous",)))
+    assert (row["status"], row["refined"]) == ("wondrous", False)
+
+
 def row(frame: int, **changes: object) -> CarRow:
     return car_rows(frame, result(car(1, 100)))[0] | changes
 
