@@ -14,7 +14,6 @@ from helpers.quick_runs import QuickRefiner, dataset, refine, refiner, result_fi
 from directshape_torch.batch.options import RunObserver
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.errors import DirectShapeError
-from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_status import read_status
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.scene.frames import FrameBatch
@@ -42,20 +41,6 @@ def test_a_truncated_image_is_reported_and_the_others_go_on(kitti_copy: Path, tm
     assert result_files(tmp_path / "out") == result_files(tmp_path / "whole")
 
 
-def test_a_line_of_14_columns_is_reported_with_its_text(kitti_copy: Path, tmp_path: Path) -> None:
-    path = kitti_copy / "detections" / "data" / "000002.txt"
-    path.write_text("Car 0 0 0 1 2 3 4 1.5 1.6 3.9 1 1.6 20\n")
-    # A blank line counts as one.
-    other = kitti_copy / "detections" / "data" / "000000.txt"
-    other.write_text(other.read_text().replace("\n", "\n\n", 1))
-    reason = refine(kitti_copy, tmp_path / "out").failed["000002"]
-    assert read_shapes(tmp_path / "out" / "shapes" / "000000.npz").input_lines.tolist() == [1, 4]
-    assert f"{path}, line 1" in reason
-    assert "14" in reason
-    (kitti_copy / "training" / "label_2" / "000001.txt").write_text("Car 0 0 0 1 2 3 4 1.5 1.6 3.9 1 1.6 20\n")
-    assert "label_2/000001.txt, line 1" in refine(kitti_copy, tmp_path / "other").failed["000001"]
-
-
 def test_an_unforeseen_error_fails_its_frame_alone(shared_kitti: Path, tmp_path: Path) -> None:
     class Sensitive(QuickRefiner):
         def forward(self, frames: FrameBatch, *args: Any) -> RefinementResult:
@@ -67,19 +52,16 @@ def test_an_unforeseen_error_fails_its_frame_alone(shared_kitti: Path, tmp_path:
     assert summary.failed == {FRAMES[1]: "ZeroDivisionError: of this frame alone"}
 
 
-@pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA is full"), RuntimeError("can't allocate memory: 9 GB")])
-def test_too_little_memory_says_what_to_do(
-    shared_kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
+def test_too_little_memory_says_what_to_do(shared_kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def no_memory(*_: object) -> None:
-        raise error
+        raise torch.OutOfMemoryError("CUDA is full")
 
     too_big = refiner(shared_kitti)
     monkeypatch.setattr(too_big, "forward", no_memory)
     summary = refine(shared_kitti, tmp_path, too_big, batch_frames=3)
     assert summary.exit_code == 1
     assert list(summary.failed) == list(FRAMES)
-    assert f"too little memory for 1 frame in a call ({type(error).__name__}: " in summary.failed["000002"]
+    assert "too little memory for 1 frame in a call (OutOfMemoryError: " in summary.failed["000002"]
     # 3 = 2 + 1, and 2 = 1 + 1.
     assert any(warning.startswith("2 calls did not work with all of their frames") for warning in summary.warnings)
 
@@ -121,8 +103,12 @@ def test_a_full_disk_stops_the_run_and_the_next_goes_on(
         def finished(self, frame_id: str, failure: str | None) -> None:
             monkeypatch.setattr("directshape_torch.batch.group_refinement.write_frame_outputs", full)
 
+    out = tmp_path / "out"
     with pytest.raises(DirectShapeError, match=r"cannot write to .*No space left.*run the same command again"):
-        refine(shared_kitti, tmp_path, observer=Filler())
+        refine(shared_kitti, out, observer=Filler())
     monkeypatch.undo()
-    summary = refine(shared_kitti, tmp_path)
+    assert not list(out.rglob("*.tmp"))
+    summary = refine(shared_kitti, out)
     assert (summary.resumed, summary.exit_code) == (FRAMES[:1], 0)
+    refine(shared_kitti, tmp_path / "whole")
+    assert result_files(out) == result_files(tmp_path / "whole")

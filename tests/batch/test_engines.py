@@ -55,39 +55,26 @@ def ends(workers: Imagined, out: Path, size: int = 1) -> dict[str, FrameEntry]:
     return {frame_id: entry for report in reports for frame_id, entry in report.ends.items()}
 
 
-def test_the_frame_that_kills_is_found_among_its_companions(tmp_path: Path) -> None:
-    workers = Imagined(lambda group: "c" in group.frame_ids)
+@pytest.mark.parametrize(("killers", "size"), [("c", 4), ("cf", 8)], ids=["one", "one in each half"])
+def test_the_frames_that_kill_are_found_among_their_companions(tmp_path: Path, killers: str, size: int) -> None:
+    workers = Imagined(lambda group: not set(killers).isdisjoint(group.frame_ids))
     reason = "its worker died each of 2 times (killed, out of memory or crashed)"
-    assert ends(workers, tmp_path, size=4) == {
-        **dict.fromkeys("abdefgh", DONE),
-        "c": {"reason": reason},
+    assert ends(workers, tmp_path, size) == {
+        **dict.fromkeys("abcdefgh", DONE),
+        **{k: {"reason": reason} for k in killers},
     }
-    names = ["abcd", "efgh", "abcd", "ab", "cd", "cd", "c", "d", "c"]
-    assert workers.calls == [tuple(each) for each in names]
     assert read_failure(tmp_path, "c") == reason
-
-
-def test_workers_that_never_finish_anything_end_the_run(tmp_path: Path) -> None:
-    with pytest.raises(DirectShapeError, match=r"workers die again and again \(killed"):
-        ends(Imagined(lambda _: True), tmp_path)
-    assert not (tmp_path / "failed").exists()
 
 
 @pytest.mark.parametrize("num_good", [0, 3])
 def test_many_groups_that_kill_end_the_run_before_all_are_tried(tmp_path: Path, num_good: int) -> None:
     groups = frame_groups([f"{number:06d}" for number in range(4000)], 4, ())
     workers = Imagined(lambda group: group not in groups[:num_good])
-    with pytest.raises(DirectShapeError, match="die again and again"):
+    with pytest.raises(DirectShapeError, match=r"workers die again and again \(killed"):
         list(reports_of(workers, SimpleNamespace(out_dir=tmp_path), groups))
+    assert not (tmp_path / "failed").exists()
     bad = [group.frame_ids for group in groups[num_good:]]
     assert workers.calls[len(groups) :] == bad[:4]
-
-
-def test_a_killer_in_each_half_of_one_group_does_not_end_the_run(tmp_path: Path) -> None:
-    workers = Imagined(lambda group: not {"c", "f"}.isdisjoint(group.frame_ids))
-    found = ends(workers, tmp_path, size=8)
-    assert sorted(name for name, entry in found.items() if "reason" in entry) == ["c", "f"]
-    assert len(found) == 8
 
 
 FRAMES = tuple(f"{number:06d}" for number in range(5))
@@ -158,17 +145,6 @@ def draw_nothing(*_: object) -> NDArray[np.uint8]:
 def test_an_error_of_a_users_code_is_told_and_is_no_death(root: Path, tmp_path: Path) -> None:
     with pytest.raises(DirectShapeError, match="OfTwoWordsError: no paint"):
         refine(root, tmp_path, QuickRefiner(root), draw=draw_nothing, batch_frames=1, workers=1)
-    assert multiprocessing.active_children() == []
-
-
-class Interrupter(RunObserver):
-    def finished(self, frame_id: str, failure: str | None) -> None:
-        raise KeyboardInterrupt
-
-
-def test_no_worker_is_left_by_an_interrupt_at_a_report(root: Path, tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        refine(root, tmp_path, QuickRefiner(root), observer=Interrupter(), batch_frames=1, workers=1)
     assert multiprocessing.active_children() == []
 
 

@@ -97,7 +97,6 @@ def test_standard_deviations_are_in_the_frame_of_the_points_and_no_mask_is_judge
 
 
 def test_points_alone_say_where_the_car_is() -> None:
-    """A box that stands beside its points draws no car to it."""
     points, _ = cars(True)
     beside = torch.tensor([[0.0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0]])
     right, wrong = (fit_shape(points, TRUE_BOXES + off, "mmdet3d_lidar", PRIOR) for off in (0 * beside, beside))

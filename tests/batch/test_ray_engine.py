@@ -9,7 +9,6 @@ import socket
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager
@@ -21,17 +20,14 @@ import torch
 from helpers import quick_runs
 from helpers.kitti_folder import SIX_FRAMES as FRAMES
 from helpers.quick_runs import result_files
+from helpers.slow_run import PATIENCE_S, environment, slow_run, wait_until
 
-import directshape_torch
 from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.ray_engine import RayEngine, check_cluster
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.io.run_folder import done_frames
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="ends processes as Linux does")
-TESTS = Path(__file__).parent.parent
-PACKAGE = Path(directshape_torch.__file__).parent.parent
-_PATIENCE_S = 180.0
 
 refine = partial(quick_runs.refine, threads=1)
 
@@ -46,11 +42,6 @@ def expected(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Mapping[st
     out = tmp_path_factory.mktemp("one")
     refine(root, out)
     return result_files(out)
-
-
-def environment(*before: Path) -> dict[str, str]:
-    paths = os.pathsep.join(map(str, (*before, PACKAGE, TESTS)))
-    return {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "RAY_USAGE_STATS_ENABLED": "0"}
 
 
 def free_port() -> int:
@@ -91,28 +82,10 @@ def node(head: str | None = None, *before: Path, prefix: tuple[str, ...] = ()) -
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def wait_until(condition: object) -> None:
-    end = time.monotonic() + _PATIENCE_S
-    while not condition():  # type: ignore[operator]
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.05)
-
-
-@contextmanager
-def driver(root: Path, out: Path, address: str) -> Iterator[subprocess.Popen[str]]:
-    """A run on the cluster whose frames take half a second and more."""
-    command = [sys.executable, str(TESTS / "helpers" / "slow_run.py"), str(root), str(out), address]
-    with subprocess.Popen(command, env=environment(), stderr=subprocess.PIPE, text=True, cwd=out.parent) as run:
-        try:
-            yield run
-        finally:
-            run.kill()
-
-
 def said(root: Path, out: Path, address: str) -> str:
     """The last line of a run that is refused before it has written anything."""
-    with driver(root, out, address) as run:
-        _, text = run.communicate(timeout=_PATIENCE_S)
+    with slow_run(root, out, address) as run:
+        _, text = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 1, text
     assert list(out.iterdir()) == []
     return text.strip().splitlines()[-1]
@@ -120,12 +93,12 @@ def said(root: Path, out: Path, address: str) -> str:
 
 def test_a_node_that_is_killed_in_the_middle(root: Path, tmp_path: Path, expected: Mapping[str, bytes]) -> None:
     out = tmp_path / "out"
-    with node() as (address, _), node(address) as (_, second), driver(root, out, address) as run:
+    with node() as (address, _), node(address) as (_, second), slow_run(root, out, address) as run:
         wait_until(lambda: run.poll() is not None or len(done_frames(out)) > 0)
         assert run.poll() is None, run.communicate()[1]
         os.kill(second, signal.SIGKILL)
         assert len(done_frames(out)) < len(FRAMES)
-        assert run.wait(_PATIENCE_S) == 0, run.communicate()[1]
+        assert run.wait(PATIENCE_S) == 0, run.communicate()[1]
     assert result_files(out) == expected
 
 
@@ -133,14 +106,14 @@ def test_a_node_that_is_killed_in_the_middle(root: Path, tmp_path: Path, expecte
 def test_a_driver_that_is_killed_and_started_anew(root: Path, tmp_path: Path, expected: Mapping[str, bytes]) -> None:
     out = tmp_path / "out"
     with node() as (address, _):
-        with driver(root, out, address) as run:
+        with slow_run(root, out, address) as run:
             wait_until(lambda: run.poll() is not None or len(done_frames(out)) > 0)
             assert run.poll() is None, run.communicate()[1]
             run.kill()
         finished = len(done_frames(out))
         assert finished < len(FRAMES)
-        with driver(root, out, address) as run:
-            assert run.wait(_PATIENCE_S) == 0, run.communicate()[1]
+        with slow_run(root, out, address) as run:
+            assert run.wait(PATIENCE_S) == 0, run.communicate()[1]
     # The run that was killed could not remove the file by which nodes recognise the folder.
     (mark,) = out.glob(".*.tmp")
     mark.unlink()

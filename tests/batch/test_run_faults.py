@@ -5,11 +5,9 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -18,18 +16,16 @@ import pytest
 from helpers import quick_runs
 from helpers.kitti_folder import SIX_FRAMES as FRAMES
 from helpers.quick_runs import FEW_STEPS, QuickRefiner, result_files
+from helpers.slow_run import PATIENCE_S, slow_run, wait_until
 
-import directshape_torch
 from directshape_torch.batch.options import RefineOptions, RunObserver
 from directshape_torch.batch.refine_dataset import refine_dataset
-from directshape_torch.errors import DirectShapeError, InputError, ResumeError
+from directshape_torch.errors import ResumeError
 from directshape_torch.io.config_files import load_config
 from directshape_torch.io.run_folder import done_frames
 from directshape_torch.io.run_status import read_status
 
 refine = partial(quick_runs.refine, threads=1)
-TESTS = Path(__file__).parent.parent
-_PATIENCE_S = 120.0
 
 
 @pytest.fixture(scope="module")
@@ -44,24 +40,9 @@ def undisturbed(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-@contextmanager
-def slow_run(root: Path, out: Path) -> Iterator[subprocess.Popen[str]]:
-    """A run with two workers; no process of it is left after the body."""
-    # The package that this test has, wherever it lies, and the helpers.
-    folders = os.pathsep.join([str(TESTS), str(Path(directshape_torch.__file__).parent.parent)])
-    environment = {**os.environ, "PYTHONPATH": folders, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(TESTS / "helpers" / "slow_run.py"), str(root), str(out)]
-    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True) as run:
-        try:
-            yield run
-        finally:
-            with suppress(ProcessLookupError):
-                os.killpg(run.pid, signal.SIGKILL)
-
-
 def stopped_in_the_middle(root: Path, out: Path, by: signal.Signals) -> str:
-    """What a run with two workers says that is stopped after a frame or two; all of its processes are gone."""
-    with slow_run(root, out) as run:
+    """What a run with a worker says that is stopped after a frame or two; all of its processes are gone."""
+    with slow_run(root, out, 1) as run:
         wait_until(lambda: run.poll() is not None or len(done_frames(out)) > 0)
         assert run.poll() is None, "the run ended before it was stopped"
         status = read_status(out)
@@ -72,7 +53,7 @@ def stopped_in_the_middle(root: Path, out: Path, by: signal.Signals) -> str:
             os.killpg(run.pid, by)
         else:
             run.send_signal(by)
-        _, said = run.communicate(timeout=_PATIENCE_S)
+        _, said = run.communicate(timeout=PATIENCE_S)
         wait_until(lambda: not any(map(is_running, workers)))
     return said
 
@@ -89,13 +70,6 @@ def is_running(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):
         return False
-
-
-def wait_until(condition: object) -> None:
-    end = time.monotonic() + _PATIENCE_S
-    while not condition():  # type: ignore[operator]
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks for processes in /proc")
@@ -148,51 +122,15 @@ def test_workers_that_still_start_say_nothing_of_an_interrupt(root: Path, tmp_pa
     with slow_run(root, tmp_path / "out") as run:
         wait_until(lambda: len(children(run.pid)) == 3)  # two workers, one that looks after what processes share
         os.killpg(run.pid, signal.SIGINT)
-        _, said = run.communicate(timeout=_PATIENCE_S)
+        _, said = run.communicate(timeout=PATIENCE_S)
     assert said.count("Traceback") == said.count("KeyboardInterrupt") == 1
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of one megabyte."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mount = shutil.which("mount")
-    if mount is None or not hasattr(os, "geteuid") or os.geteuid() != 0:
-        pytest.skip("only root can mount a small file system")
-    mounted = subprocess.run(
-        [mount, "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)], capture_output=True, text=True, check=False
-    )
-    if mounted.returncode:
-        pytest.skip(f"no file system can be mounted here: {mounted.stderr.strip()}")
-    yield disk
-    subprocess.run(["umount", str(disk)], check=True)
-
-
-@pytest.mark.parametrize("room_kb", [20, 52, 60])
-def test_a_full_disk_stops_a_run_and_room_lets_it_go_on(
-    root: Path, small_disk: Path, undisturbed: Path, room_kb: int
-) -> None:
-    out = small_disk / "out"
-    out.mkdir()
-    free = shutil.disk_usage(small_disk).free
-    (small_disk / "filler").write_bytes(b"x" * (free - room_kb * 1024))
-    with pytest.raises((DirectShapeError, OSError), match="No space left on device"):
-        refine(root, out)
-    assert not list(out.rglob("*.tmp"))
-    (small_disk / "filler").unlink()
-    finished = done_frames(out)
-    summary = refine(root, out)
-    assert list(summary.resumed) == finished
-    assert len(summary.timings.calls) == len(FRAMES) - len(summary.resumed)
-    assert result_files(out) == result_files(undisturbed)
 
 
 @pytest.mark.long
 def test_two_runs_at_once(root: Path, tmp_path: Path, undisturbed: Path) -> None:
     with slow_run(root, tmp_path / "out") as one, slow_run(root, tmp_path / "out") as other:
         for run in (one, other):
-            _, said = run.communicate(timeout=_PATIENCE_S)
+            _, said = run.communicate(timeout=PATIENCE_S)
             assert run.returncode == 0, said
     assert result_files(tmp_path / "out") == result_files(undisturbed)
 
@@ -234,11 +172,6 @@ class Rival(RunObserver):
 def test_a_run_whose_folder_another_one_has_taken_says_so(root: Path, tmp_path: Path) -> None:
     with pytest.raises(ResumeError, match=r"refiner\.silhouette\.weight' was 6\.0, now is 12\.0"):
         refine(root, tmp_path, observer=Rival(root, tmp_path))
-
-
-def test_a_url_is_no_output_folder(root: Path) -> None:
-    with pytest.raises(InputError, match=r"out: expected a folder of a file system, got s3:/bucket/out; mount it"):
-        refine(root, Path("s3://bucket/out"))
 
 
 @pytest.mark.parametrize("name", ["data/000002.txt", "shapes/000002.npz"])

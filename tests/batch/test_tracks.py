@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -30,15 +31,22 @@ def sequence(shared_kitti: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return root
 
 
-def refine(kitti: Path, sequence: Path, out: Path, batch_frames: int = 16, fresh: bool = False) -> RunSummary:
+def refine(kitti: Path, sequence: Path, out: Path, batch_frames: int = 16) -> RunSummary:
     dataset = open_dataset("tracking", sequence, sequence / "results", kitti / "masks", tracks=True)
-    return refine_dataset(dataset, refiner(kitti), out, RefineOptions(batch_frames=batch_frames), fresh=fresh)
+    return refine_dataset(dataset, refiner(kitti), out, RefineOptions(batch_frames=batch_frames))
 
 
-def test_views_of_a_track_share_a_shape(shared_kitti: Path, sequence: Path, tmp_path: Path) -> None:
-    refine(shared_kitti, sequence, tmp_path)
+@pytest.fixture(scope="module")
+def whole(shared_kitti: Path, sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run, which no test changes."""
+    out = tmp_path_factory.mktemp("whole")
+    assert not refine(shared_kitti, sequence, out).warnings
+    return out
+
+
+def test_views_of_a_track_share_a_shape(whole: Path) -> None:
     # Lines are those of the frame, not of the sequence's file.
-    run = RunFolder(tmp_path)
+    run = RunFolder(whole)
     assert [len(run.read(frame_id).cars) for frame_id in run.frame_ids] == [2] * len(FRAMES)
     frames = [run.read(frame_id).shapes for frame_id in run.frame_ids]
     assert [frame.tracks for frame in frames] == [("000000", "000002")] * len(FRAMES)
@@ -51,23 +59,23 @@ def test_views_of_a_track_share_a_shape(shared_kitti: Path, sequence: Path, tmp_
 def test_split_tracks_are_named(
     shared_kitti: Path, sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert not refine(shared_kitti, sequence, tmp_path / "whole").warnings
     # Behind the first of three views.
     monkeypatch.setattr(same_car, "_of_one_car", lambda views, *_: [x for x in (views[:-2], views[-2:]) if x])
-    (warning,) = refine(shared_kitti, sequence, tmp_path / "split").warnings
+    (warning,) = refine(shared_kitti, sequence, tmp_path).warnings
     assert warning == "tracks seem to be of two cars, and were split (docs/tracks.md): 000000, 000002"
-    frames = [read_shapes(tmp_path / "split" / "shapes" / f"{number:06d}.npz") for number in range(len(FRAMES))]
+    frames = [read_shapes(tmp_path / "shapes" / f"{number:06d}.npz") for number in range(len(FRAMES))]
     assert [frame.track_parts[0] for frame in frames] == [-1, 1, 1]
 
 
-def test_an_interrupted_run_keeps_to_its_windows(shared_kitti: Path, sequence: Path, tmp_path: Path) -> None:
-    refine(shared_kitti, sequence, tmp_path)
-    before = result_files(tmp_path)
-    (tmp_path / "shapes" / "000000.npz").unlink()
-    assert refine(shared_kitti, sequence, tmp_path).resumed == ("000001", "000002")
-    assert result_files(tmp_path) == before
+def test_an_interrupted_run_keeps_to_its_windows(
+    shared_kitti: Path, sequence: Path, whole: Path, tmp_path: Path
+) -> None:
+    out = Path(shutil.copytree(whole, tmp_path / "out"))
+    (out / "shapes" / "000000.npz").unlink()
+    assert refine(shared_kitti, sequence, out).resumed == ("000001", "000002")
+    assert result_files(out) == result_files(whole)
     with pytest.raises(ResumeError, match="setting 'track_frames' was 16, now is 1"):
-        refine(shared_kitti, sequence, tmp_path, batch_frames=1)
+        refine(shared_kitti, sequence, out, batch_frames=1)
 
 
 def test_windows_cover_every_frame_once() -> None:

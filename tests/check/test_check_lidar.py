@@ -58,10 +58,14 @@ def dataset(root: Path, scans: Path | None = None) -> StereoDataset:
     return open_dataset("kitti", root, root / "detections", root / "training" / "masks", lidar_dir=scans)
 
 
-def report_of(root: Path, scans: Path, points: Points) -> CheckReport:
+def with_scan(root: Path, scans: Path, points: Points) -> StereoDataset:
     scans.mkdir(exist_ok=True)
     points.astype("<f4").tofile(scans / "000000.bin")
-    return check_dataset(dataset(root, scans))
+    return dataset(root, scans)
+
+
+def report_of(root: Path, scans: Path, points: Points) -> CheckReport:
+    return check_dataset(with_scan(root, scans, points))
 
 
 def five_columns(points: Points) -> Points:
@@ -136,10 +140,8 @@ def test_the_run_is_refused_in_the_same_words(
 
 
 def test_points_of_a_call(demo: tuple[Path, Points], tmp_path: Path) -> None:
-    """Tensors of the left camera, and those that were left in the axes of a LiDAR."""
     root, points = demo
-    assert report_of(root, tmp_path, points).findings == ()
-    frames, detections = collate([dataset(root, tmp_path).load("000000")])
+    frames, detections = collate([with_scan(root, tmp_path, points).load("000000")])
     assert check_scene(frames, detections, match_images=False).findings == ()
     of_lidar = replace(frames, points_cam=torch.from_numpy(points[None, :, :3].copy()))
     (finding,) = check_scene(of_lidar, detections, match_images=False).findings

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.check import check_dataset as module
 from directshape_torch.check.check_dataset import check_dataset
-from directshape_torch.check.check_images import PairMatches, check_calibration, check_pair
+from directshape_torch.check.check_images import PairMatches, check_calibration, check_frame, check_pair
 from directshape_torch.check.check_places import check_distances
 from directshape_torch.check.finding import CheckReport, Finding, by_severity
 from directshape_torch.check.mistakes import MISTAKES, found, unreadable, words_of_files, words_of_tensors
@@ -28,6 +28,7 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry.box_formats import BoxFormat
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.io.image_files import read_pair
 from directshape_torch.io.kitti_calibration import KittiCalibration
 from directshape_torch.io.stereo_dataset import LayoutName, open_dataset
 
@@ -135,8 +136,19 @@ def test_distances_tell_the_baseline_from_the_boxes() -> None:
     assert "focal length" in check_distances(ratios(1.5, 0.7))[0].cure
 
 
+def test_matches_alone_settle_a_doubt_about_intrinsics() -> None:
+    left, right = (next((DEMO / "training" / folder).glob("000000.*")) for folder in ("image_2", "image_3"))
+    pair = read_pair(left, right)
+    height, width = pair[0].shape[:2]
+    K = np.array([[0.6 * width, 0.0, 0.5 * width], [0.0, 0.6 * width, 0.5 * height], [0.0, 0.0, 1.0]])
+    numbers = ({"left": K, "right": K + np.array([[0, 0, 0], [0, 0, 1], [0, 0, 0]])}, 0.5)
+    for match_images, said in ((False, [("raw_intrinsics", "warning")]), (True, [])):
+        of_frame, _, usable = check_frame(numbers, None, pair, (height, width), "frame a", KITTI_WORDS, match_images)
+        assert [(one.check, one.severity) for one in of_frame] == said
+        assert usable is pair
+
+
 def test_a_damaged_frame_of_a_folder_is_one_finding_and_hides_no_other(kitti: Path, tmp_path: Path) -> None:
-    """Its file holds detections, masks and plane."""
     write_folder(kitti, tmp_path, ("000000", "000001"))
     path = tmp_path / "frames" / "000001.json"
     path.write_text(path.read_text()[:300])
@@ -227,7 +239,6 @@ def test_a_plain_folder_is_spoken_of_by_its_own_keys(
 
 
 def test_every_kind_of_mistake_has_words_in_every_source() -> None:
-    """A finding is made without a word missing, of any convention and of any layout."""
     sources = [
         *map(words_of_tensors, get_args(BoxFormat)),
         words_of_files(Path("calib.txt"), ("P_rect_02", "P_rect_03")),
@@ -306,17 +317,13 @@ def test_a_field_that_the_cars_contradict(bias_px: float, expected: list[str], m
 DATA = os.environ.get("DIRECTSHAPE_DATA")
 
 
+@pytest.mark.long
 @pytest.mark.skipif(DATA is None, reason="DIRECTSHAPE_DATA is not set")
 @pytest.mark.parametrize(
     ("layout", "root", "detections", "masks"),
     [
-        *(
-            pytest.param("kitti", root, f"{root}/detections/{boxes}", f"{root}/{masks}", marks=pytest.mark.long)
-            for root, boxes, masks in (
-                ("rendered", "mono", "masks_degraded"),
-                ("kitti", "noisy_stereo", "training/masks"),
-            )
-        ),
+        ("kitti", "rendered", "rendered/detections/mono", "rendered/masks_degraded"),
+        ("kitti", "kitti", "kitti/detections/noisy_stereo", "kitti/training/masks"),
         ("tracking", "kitti/tracking/0005", "kitti/tracking/0005/detections/pointrcnn", "kitti/tracking/0005"),
     ],
 )

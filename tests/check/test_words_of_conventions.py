@@ -20,11 +20,7 @@ from directshape_torch.geometry.box_formats import BoxFormat, box_form, poses_to
 T_CAM_LIDAR = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, -0.1], [1, 0, 0, -0.2], [0, 0, 0, 1]])
 T_CAM_TOP = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1, -0.1], [0, 1, 0, -0.2], [0, 0, 0, 1]])
 CONVENTIONS: tuple[BoxFormat, ...] = get_args(BoxFormat)
-LIDAR: dict[BoxFormat, Tensor] = {
-    "mmdet3d_lidar": T_CAM_LIDAR,
-    "openpcdet": T_CAM_LIDAR,
-    "nuscenes": T_CAM_TOP,
-}
+LIDAR: dict[BoxFormat, Tensor] = {"mmdet3d_lidar": T_CAM_LIDAR, "openpcdet": T_CAM_LIDAR, "nuscenes": T_CAM_TOP}
 # What only files of KITTI have.
 FOREIGN = ("rotation_y", "P2", "P3", "--classes", "--split", "category_id")
 
@@ -129,7 +125,6 @@ def test_a_mistake_is_named_in_the_words_of_the_convention(convention: BoxFormat
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_axes_of_another_frame(convention: BoxFormat) -> None:
-    """Boxes of a camera for those of a LiDAR, and the other way round."""
     frames, cars = demo()
     source: BoxFormat = "openpcdet" if convention not in LIDAR else "opencv"
     boxes = poses_to_boxes(cars.T_cam_obj, cars.dimensions_hwl, source, LIDAR.get(source))

@@ -9,15 +9,9 @@ from parametric_cars.measures import sample_car
 from parametric_cars.surfaces import car_mesh
 
 from directshape_torch.cli import build_prior
-from directshape_torch.cli.main import main, make_parser
+from directshape_torch.cli.main import main
 from directshape_torch.files.mesh_files import read_mesh
 from directshape_torch.shape.pca_prior import PCAShapePrior
-
-
-def run(*arguments: str) -> int:
-    args = make_parser().parse_args(["build-prior", *arguments])
-    code: int = args.run(args)
-    return code
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +28,7 @@ OPTIONS = ("--up-axis=-y", "--num-codes", "1", "--spacing", "0.2", "--voxel", "0
 
 def test_writes_prior_and_report(meshes, tmp_path, capsys):
     out = tmp_path / "made" / "car.safetensors"
-    assert run("--meshes", str(meshes), "--out", str(out), *OPTIONS) == 0
+    assert main(["build-prior", "--meshes", str(meshes), "--out", str(out), *OPTIONS]) == 0
     prior = PCAShapePrior.load(out)
     assert prior.num_codes == 1
     assert prior.provenance.num_samples == 3
@@ -50,7 +44,7 @@ def test_writes_prior_and_report(meshes, tmp_path, capsys):
 
 def test_two_cars_say_nothing_of_a_third(meshes, tmp_path, capsys):
     out = tmp_path / "car.safetensors"
-    assert run("--meshes", str(meshes), "--out", str(out), "--pattern", "car[01].*", *OPTIONS) == 0
+    assert main(["build-prior", "--meshes", str(meshes), "--out", str(out), "--pattern", "car[01].*", *OPTIONS]) == 0
     assert json.loads(out.with_suffix(".json").read_text())["leave_one_out_error_cm"] is None
     assert "leave-one-out error within 7 cm of the surface: not known, of two cars" in capsys.readouterr().out
 
@@ -87,7 +81,7 @@ def test_wrong_meshes_among_good_ones_are_left_out_by_name(meshes, tmp_path, cap
     turned(meshes, folder, (1, 2, 0), 1.0, ".off")
     (folder / "broken.obj").write_text("v 0 0 0\n")
     out = tmp_path / "car.safetensors"
-    assert run("--meshes", str(folder), "--out", str(out), *OPTIONS) == 3
+    assert main(["build-prior", "--meshes", str(folder), "--out", str(out), *OPTIONS]) == 3
     said = capsys.readouterr().out
     assert "skipped car2.ply: " in said
     assert "it looks like a car lying on its side; it needs --forward-axis=+z --up-axis=-x" in said
@@ -104,7 +98,7 @@ def test_meshes_of_another_class_get_a_grid_of_their_size(tmp_path, capsys):
     words = ("--meshes", str(tmp_path), "--out", str(out), "--num-codes", "1", "--spacing", "0.3", "--voxel", "0.1")
     assert main(["build-prior", *words]) == 2
     assert "--not-cars if it is of another class" in capsys.readouterr().err
-    assert run(*words, "--not-cars") == 0
+    assert main(["build-prior", *words, "--not-cars"]) == 0
     prior = PCAShapePrior.load(out)
     assert not prior.provenance.of_cars
     assert prior.dimensions_mean_hwl.tolist() == pytest.approx([3.1, 2.47, 11.17], abs=0.15)
@@ -115,7 +109,7 @@ def test_meshes_of_another_class_get_a_grid_of_their_size(tmp_path, capsys):
 @pytest.mark.filterwarnings("always::directshape_torch.errors.PriorWarning")
 def test_a_prior_that_is_no_car_is_warned_of_in_a_line(meshes, tmp_path, capsys):
     folder, out = turned(meshes, tmp_path / "small", (0, 1, 2), 0.5), tmp_path / "car.safetensors"
-    assert run("--meshes", str(folder), "--out", str(out), *OPTIONS, "--not-cars") == 0
+    assert main(["build-prior", "--meshes", str(folder), "--out", str(out), *OPTIONS, "--not-cars"]) == 0
     prior = PCAShapePrior.load(out)
     prior.provenance = replace(prior.provenance, of_cars=True)
     prior.save(out)

@@ -28,11 +28,7 @@ def test_writes_the_formats_and_only_reads_the_run(
     data = ("--data", finished.root, "--masks", finished.root / "masks")
     assert main(command(finished, tmp_path, *formats, *data)) == 0
     assert capsys.readouterr().out == f"exported  1 frames as glb, kitti to {tmp_path}\n"
-    assert sorted(contents(tmp_path)) == [
-        "glb/000001.glb",
-        "kitti/data/000001.txt",
-        "kitti/json/000001.json",
-    ]
+    assert sorted(contents(tmp_path)) == ["glb/000001.glb", "kitti/data/000001.txt", "kitti/json/000001.json"]
     assert contents(finished.out) == before
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -45,43 +44,31 @@ def test_the_version_is_that_of_the_program(capsys: pytest.CaptureFixture[str]) 
         directshape_torch.nothing  # noqa: B018
 
 
-def test_an_error_is_one_line_and_exit_code_2(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (
+            DataFormatError("calib/000001.txt", "expected 12 numbers,\n got 11", line_number=3),
+            program.EXIT_WRONG_INPUT,
+            "error: calib/000001.txt, line 3: expected 12 numbers, got 11",
+        ),
+        (BrokenPipeError("a worker is gone"), program.EXIT_WRONG_INPUT, "error: a worker is gone"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+    ],
+)
+def test_an_error_is_one_line_and_an_exit_code(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int, said: str
 ) -> None:
     def fail(_: object) -> int:
-        raise DataFormatError("calib/000001.txt", "expected 12 numbers,\n got 11", line_number=3)
+        raise error
 
     monkeypatch.setattr("directshape_torch.cli.demo.run", fail)
-    assert program.main(["demo"]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err == "directshape: error: calib/000001.txt, line 3: expected 12 numbers, got 11\n"
-
-
-def test_a_folder_that_cannot_be_made_is_one_line_and_exit_code_2(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "file").write_text("")
-    assert program.main(["demo", "--out", str(tmp_path / "file" / "out")]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("directshape: error: ")
-    assert str(tmp_path / "file") in error
-    assert error.count("\n") == 1
-
-
-def test_an_interrupted_run_is_exit_code_130(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupt(_: object) -> int:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("directshape_torch.cli.demo.run", interrupt)
-    assert program.main(["demo"]) == 130
-    assert capsys.readouterr().err == "directshape: interrupted\n"
+    assert program.main(["demo"]) == code
+    shown = capsys.readouterr()
+    assert (shown.out.strip(), shown.err) == ("", f"directshape: {said}\n")
 
 
 def test_the_package_is_the_program_and_help_loads_only_what_it_needs() -> None:
-    """Not what only some commands need, or nobody has installed."""
     script = (
         "import runpy, sys, directshape_torch\nbefore, sys.argv = set(sys.modules), ['directshape', '--help']\n"
         "try: runpy.run_module('directshape_torch', run_name='__main__')\n"
@@ -106,12 +93,3 @@ def test_a_reader_that_has_seen_enough_is_no_error() -> None:
         process.stdout.close()
         assert process.stderr.read() == ""
         assert process.wait(60) == program.EXIT_OUTPUT_CLOSED
-
-
-def test_another_broken_pipe_is_an_error(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(_: object) -> int:
-        raise BrokenPipeError("a worker is gone")
-
-    monkeypatch.setattr("directshape_torch.cli.demo.run", fail)
-    assert program.main(["demo"]) == program.EXIT_WRONG_INPUT
-    assert capsys.readouterr().err == "directshape: error: a worker is gone\n"

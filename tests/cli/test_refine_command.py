@@ -81,12 +81,7 @@ def test_threads_are_those_asked_for_one_by_default(kitti: Path, tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("name", "reason"),
-    [
-        ("gpu", "Expected one of cpu"),
-        ("cuda:99", "CUDA"),
-        ("", "not be empty"),
-    ],
+    ("name", "reason"), [("gpu", "Expected one of cpu"), ("cuda:99", "CUDA"), ("", "not be empty")]
 )
 def test_a_device_that_is_not_there_is_refused_with_pytorchs_reason(name: str, reason: str) -> None:
     with pytest.raises(InputError, match=rf"--device: expected a device of this machine, got '{name}' \(.*{reason}"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 import shutil
 from pathlib import Path
 
@@ -13,9 +12,10 @@ from helpers.kitti_folder import write_data_set
 from test_refine_command import command
 
 from directshape_torch.cli.main import main
+from directshape_torch.errors import DataFormatError
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import RunFolder
-from directshape_torch.io.stereo_dataset import open_dataset
+from directshape_torch.io.velodyne import read_points
 
 FRAMES = ("000000", "000001")
 # The scanner stands in camera 0: x forward, y left, z up becomes x right, y down, z forward.
@@ -53,35 +53,15 @@ def refine(root: Path, out: Path, *extra: object) -> int:
     return main(command(root, out, *map(str, extra)))
 
 
-def test_scans_are_read_in_the_left_camera_and_batched(source: Path) -> None:
-    from directshape_torch.io.frame_collation import collate
-
-    dataset = open_dataset("kitti", source, source / "detections", source / "masks", lidar_dir=source / "velodyne")
-    # As a worker gets it.
-    dataset = pickle.loads(pickle.dumps(dataset))
-    loaded = [dataset.load(frame_id) for frame_id in FRAMES]
-    points = loaded[0].frame.points_cam
-    label = np.array((source / "training" / "label_2" / "000000.txt").read_text().split()[11:14], dtype=float)
-    # The grid's middle, 0.8 m above the label's origin; the left camera stands beside camera 0 and sees all of it.
-    middle = loaded[0].frame.camera.t_cam_ref[0].double().numpy() + label - [0, 0.8, 0]
-    np.testing.assert_allclose(points[0].double().mean(dim=0).numpy(), middle, atol=1e-5)
-    frames, _ = collate(loaded)
-    assert frames.points_cam.shape == (2, 64, 3)
-
-
-def test_the_results_and_the_manifest_know_the_scans(source: Path, tmp_path: Path) -> None:
-    assert refine(source, tmp_path, "--lidar", source / "velodyne") == 0
-    assert "lidar" in read_shapes(tmp_path / "shapes" / "000000.npz").term_names
-    assert "lidar" in RunFolder(tmp_path).read("000001").record.inputs
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["config"]["extra_terms"] == ["LidarPoints(weight=300.0, huber_m=0.1)"]
-
-
-def test_other_scans_or_none_are_no_resumption(
+def test_a_run_knows_its_scans_and_does_not_go_on_with_others(
     source: Path, scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
     assert refine(source, out, "--lidar", scans) == 0
+    assert "lidar" in read_shapes(out / "shapes" / "000000.npz").term_names
+    assert "lidar" in RunFolder(out).read("000001").record.inputs
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["config"]["extra_terms"] == ["LidarPoints(weight=300.0, huber_m=0.1)"]
     write_scan(scans / "000001.bin", np.ones((20, 3)))
     assert refine(source, out, "--lidar", scans) == 2
     assert "cannot resume: frame 000001: sha256 of 'lidar' was" in capsys.readouterr().err
@@ -89,25 +69,28 @@ def test_other_scans_or_none_are_no_resumption(
     assert "cannot resume: setting 'extra_terms' was" in capsys.readouterr().err
 
 
-def test_a_missing_or_damaged_scan_fails_its_frame_by_name(
+def test_a_missing_scan_fails_its_frame_by_name(
     source: Path, scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def failure(content: bytes | None) -> str:
-        (scans / "000000.bin").unlink(missing_ok=True)
-        if content is not None:
-            (scans / "000000.bin").write_bytes(content)
-        out = tmp_path / "out"
-        assert refine(source, out, "--lidar", scans, "--fresh") == 1
-        assert (out / "data" / "000001.txt").is_file()
-        return capsys.readouterr().err
+    (scans / "000000.bin").unlink()
+    assert refine(source, tmp_path / "out", "--lidar", scans) == 1
+    assert (tmp_path / "out" / "data" / "000001.txt").is_file()
+    said = f"frame 000000 failed: {scans / '000000.bin'}: cannot be read (No such file or directory)"
+    assert said in capsys.readouterr().err
 
-    at = f"frame 000000 failed: {scans / '000000.bin'}: "
-    assert at + "cannot be read (No such file or directory)" in failure(None)
-    assert at + "expected 16 bytes a point (x, y, z, reflectance), got 17 bytes" in failure(bytes(17))
-    nothing = np.full((3, 4), np.nan, dtype="<f4").tobytes()
-    assert at + "none of its 3 points has finite coordinates" in failure(nothing)
-    assert at + "expected 16 bytes a point" in failure(bytes(20))
-    assert "whole points of 5 numbers each (nuScenes writes 5): keep four" in failure(bytes(20))
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (bytes(17), r"expected 16 bytes a point \(x, y, z, reflectance\), got 17 bytes"),
+        (bytes(20), r"expected 16 bytes a point .* whole points of 5 numbers each \(nuScenes writes 5\): keep four"),
+        (np.full((3, 4), np.nan, dtype="<f4").tobytes(), "none of its 3 points has finite coordinates"),
+    ],
+)
+def test_a_damaged_scan_is_refused_by_name(tmp_path: Path, content: bytes, said: str) -> None:
+    (tmp_path / "000000.bin").write_bytes(content)
+    with pytest.raises(DataFormatError, match=rf"000000\.bin: .*{said}"):
+        read_points(tmp_path / "000000.bin")
 
 
 def test_a_calibration_without_scanner(

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.bundled_frame import BOXES, DEMO, LABELS, MASKS
+from helpers.bundled_frame import BOXES, DEMO, MASKS
 
 from directshape_torch.cli.main import main
 from directshape_torch.io.kitti_labels import read_objects
@@ -57,19 +56,6 @@ def test_each_mask_has_a_line(run: Path) -> None:
     assert shapes.statuses.count("no_start") == 1
 
 
-def test_results_are_near_the_truth(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    table = tmp_path / "cars.csv"
-    assert main(["compare", "--labels", str(LABELS), "--after", str(run), "--csv", str(table)]) == 0
-    printed = capsys.readouterr().out
-    assert "6 detections of 6 counted labels" in printed
-    assert "before" not in printed
-    with table.open() as file:
-        cars = list(csv.DictReader(file))
-    assert np.mean([float(car["bev_iou_after"]) for car in cars]) > 0.75
-    assert max(float(car["yaw_axis_deg_after"]) for car in cars) < 20
-    assert {car["bev_iou_before"] for car in cars} == {""}
-
-
 def test_a_run_goes_on_and_is_not_one_with_boxes(
     run: Path, masks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -98,11 +84,9 @@ def test_all_that_reads_a_run_reads_this_one(run: Path, masks: Path, tmp_path: P
 def test_the_data_are_checked_and_inspected(masks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check-data", *inputs(masks)]) == 0
     assert "with 7 cars" in capsys.readouterr().out
-    inspect = ["inspect", *inputs(masks), "--frames", "0", "--out", str(tmp_path), "--config", "fast", *QUICK[:2]]
-    assert main([*inspect, "--car", "2"]) == 0
+    words = ["--frames", "0", "--car", "2", "--out", str(tmp_path), "--config", "fast", *QUICK[:2]]
+    assert main(["inspect", *inputs(masks), *words]) == 0
     assert (tmp_path / "000000_2" / "residuals.png").is_file()
-    assert main([*inspect, "--car", "1"]) == 2
-    assert "no_start" in capsys.readouterr().err
 
 
 def test_masks_without_cars_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -49,11 +49,6 @@ def test_a_preset_with_disparity_maps(source: Path, tmp_path: Path, preset: str)
         assert ("photometric" in shapes.term_names) == (preset == "combined")
 
 
-def test_without_maps_the_images_are_matched(source: Path, tmp_path: Path) -> None:
-    assert refine(source, tmp_path, "--config", "geometric", "--frames", "0") == 0
-    assert "disparity" not in RunFolder(tmp_path).read("000000").record.inputs
-
-
 def test_a_bad_map_fails_its_frame_alone(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = Path(shutil.copytree(source / "disparity", tmp_path / "disparity"))
     write_disparity(folder / "000000.png", np.ones((9, 9)))

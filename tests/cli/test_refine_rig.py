@@ -52,9 +52,10 @@ def test_is_estimated_kept_and_shown(source: Path, tmp_path: Path, capsys: pytes
     assert line.partition(";")[0] in (out / "report.html").read_text()
     # Of so few cars each has an unknown offset, unless the rig is said to be exact.
     assert "rig" in read_shapes(out / "shapes" / "000000.npz").term_names
-    assert main(command(source, tmp_path / "none", "--rig", "none")) == 0
-    assert not (tmp_path / "none" / "rig.json").exists()
-    assert "rig" not in read_shapes(tmp_path / "none" / "shapes" / "000000.npz").term_names
+    assert main(command(source, out, "--rig", "none", "--fresh")) == 0
+    assert "rig" not in read_shapes(out / "shapes" / "000000.npz").term_names
+    assert main(["report", str(out), "--data", str(source)]) == 0
+    assert line.partition(";")[0] not in (out / "report.html").read_text()
 
 
 def test_frames_of_two_rigs_are_refined_in_one_run(
@@ -109,12 +110,3 @@ def test_a_refused_run_leaves_the_folder_as_it_was(source: Path, tmp_path: Path)
     assert main(command(source, source / "detections")) == 2
     assert not list(tmp_path.rglob("rig.*"))
     assert main(command(source, out, *none)) == 0
-
-
-def test_a_run_without_a_rig_has_none_of_an_earlier_run(source: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    assert main(command(source, out)) == 0
-    line = str(load_rigs(out / "rig.json")[0]).partition(";")[0]
-    assert main(command(source, out, "--rig", "none", "--fresh")) == 0
-    assert main(["report", str(out), "--data", str(source)]) == 0
-    assert line not in (out / "report.html").read_text()

@@ -73,6 +73,8 @@ CASES = [
     ("report {run} --html {root}", "--html: expected a file, got the folder"),
     (f"{MASKED} --prior pcaa", "directshape build-prior; bundled ones are pca and neural"),
     (f"{MASKED} --threads 0", "threads: expected at least 1, got 0"),
+    (f"{MASKED} --batch-frames 0", "batch_frames: expected at least 1, got 0"),
+    (MASKED.replace("{out}", "s3://bucket/out"), "expected a folder of a file system, got s3:/bucket/out; mount it"),
     (f"{MASKED} --lidar nowhere", "nowhere: is no folder of LiDAR scans"),
     (
         f"{MASKED} --disparity x",
@@ -83,7 +85,10 @@ CASES = [
         "check-data --data {root} --detections {root}/detections --masks {root}/masks --frames 77",
         "such as 000000, got 77",
     ),
-    ("evaluate --labels {root}/training/label_2 --results {root}/training/label_2", "a result without score"),
+    (
+        "evaluate --labels {root}/training/label_2 --results {root}/training/label_2",
+        "000000.txt, line 1: a result without score: ",
+    ),
     (f"compare --labels {DEMO_FOLDER}/training/label_2 --after nowhere", "nowhere: is no folder of result files"),
     (f"{DEMO_MASKS.replace('calibrate-rig', 'refine')} --classes Van --out {{out}}", "classes: expected Car"),
     (f"{DEMO_MASKS} --out {{out}}/a.json", "--detections: expected boxes of a detector, got none; --from detections"),

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -158,7 +157,6 @@ def test_empty_files_and_no_files(tmp_path: Path):
 
 
 def test_files_of_the_tracking_benchmark(folders: tuple[Path, Path, Path], tmp_path: Path):
-    """One file a sequence, or that file itself, with the figures of a file a frame."""
     expected = [(car.before, car.after) for car in compare_results(*folders).cars]
     sequences = []
     for folder in (folders[0], folders[1] / "data"):
@@ -212,7 +210,6 @@ def test_a_file_in_the_folder_of_its_sequence_is_one_of_a_frame(tmp_path: Path, 
 
 
 def test_a_split_of_drives_serves_the_evaluation(tmp_path: Path) -> None:
-    """Which drive its files are of, nobody says there."""
     (tmp_path / "split.txt").write_text("2011_09_26/2011_09_26_drive_0005_sync 0000000007 l\n")
     assert chosen_frames(["0000000005", "0000000007"], None, tmp_path / "split.txt", "frames") == ["0000000007"]
 
@@ -256,16 +253,6 @@ def test_results_without_boxes_before_are_measured_alone(folders: tuple[Path, Pa
     content = json.loads((tmp_path / "all.json").read_text())
     assert content["overall"]["metrics"]["centre_m_median"]["before"] is None
     assert "->" not in format_comparison(found)
-
-
-@pytest.mark.skipif("DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA is not set: rendered frames needed")
-@pytest.mark.parametrize(("detector", "bev_iou"), [("stereo", 0.722), ("mono", 0.487), ("gt", 1.0)])
-def test_simulated_detectors(detector: str, bev_iou: float):
-    root = Path(os.environ["DIRECTSHAPE_DATA"]) / "rendered"
-    folder = root / "detections" / detector
-    overall = compare_results(root / "training" / "label_2", folder, folder).overall
-    assert overall.metrics["bev_iou_mean"].after.value == pytest.approx(bev_iou, abs=2e-3)
-    assert overall.num_detections == (102 if detector == "gt" else 97)
 
 
 @pytest.mark.parametrize("named", ["", "frames"])

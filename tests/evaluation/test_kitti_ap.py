@@ -109,13 +109,6 @@ class TestFilesAndErrors:
                 (tmp_path / folder / f"{frame}.txt").write_text(text + "\n")
         return tmp_path / "labels", tmp_path / "results"
 
-    def test_folders_and_a_split_file(self, folders: tuple[Path, Path], tmp_path: Path) -> None:
-        (tmp_path / "val.txt").write_text("000002\n")
-        assert evaluate_kitti(*folders).num_frames == 2
-        scores = evaluate_kitti(str(folders[0]), str(folders[1] / "data"), split=str(tmp_path / "val.txt"))
-        assert (scores.num_frames, scores.num_result_frames_unused) == (1, 1)
-        assert scores.score("3d", 0.7, "easy").ap_area == 100
-
     def test_accents_may_be_written_differently_in_each_folder(self, tmp_path: Path) -> None:
         names = [
             tmp_path / folder / unicodedata.normalize(form, "é1.txt") for folder, form in (("a", "NFC"), ("b", "NFD"))
@@ -126,12 +119,6 @@ class TestFilesAndErrors:
         assert evaluate_kitti(tmp_path / "a", tmp_path / "b").score("3d", 0.7, "easy").ap_area == 100
         for name in (path.stem for path in names):
             assert evaluate_kitti(tmp_path / "b", tmp_path / "b", frames=[name]).num_frames == 1
-
-    def test_a_result_without_score(self, folders: tuple[Path, Path]) -> None:
-        path = folders[1] / "data" / "000002.txt"
-        path.write_text(f"{line(score=1)}\n\n{line(1)}\n")
-        with pytest.raises(DataFormatError, match=r"000002.txt, line 3: a result without score: .*column 16"):
-            evaluate_kitti(*folders)
 
     def test_a_folder_that_is_missing(self, folders: tuple[Path, Path]) -> None:
         with pytest.raises(DataFormatError, match="labl: is no folder of labels"):

@@ -51,7 +51,8 @@ def test_equals_the_devkit_taken_frame_by_frame(seed: int) -> None:
 
 
 @pytest.mark.skipif("DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA is not set: KITTI labels needed")
-@pytest.mark.parametrize("detector", ["frustum_pointnet", pytest.param("pointgnn", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("detector", ["frustum_pointnet", "pointgnn"])
 def test_agrees_with_known_scores_in_every_cell(tmp_path: Path, detector: str) -> None:
     """3769 frames; the curves of the first detector at IoU 0.7 are the official evaluator's, six decimals."""
     root = Path(os.environ["DIRECTSHAPE_DATA"]) / "kitti_eval"

@@ -36,7 +36,6 @@ def test_a_detection_without_a_2d_box_takes_the_nearest_label(box):
 
 
 def test_a_detection_with_a_2d_box_of_its_own_takes_no_label_that_this_misses():
-    """A false positive beside a car that nobody detected."""
     label = _object((100, 100, 200, 200), x=0.0)
     assert match_to_labels([_object((250 + x, 100, 360, 200), x=x) for x in (1.0, 3.9)], [label]) == {}
     # Half a metre away it is the same car whatever its box says.

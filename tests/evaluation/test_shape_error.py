@@ -26,12 +26,6 @@ def test_completeness_and_accuracy_are_told_apart() -> None:
     assert error.rmse_m == pytest.approx([0.1, np.sqrt((0.01 + 0.04) / 2), np.sqrt((0.01 + 0.04 + 0.81) / 3)])
 
 
-def test_within_is_at_most() -> None:
-    error = shape_error(np.zeros((1, 3)), np.array([[0.5, 0.0, 0.0]]), taus_m=(0.5,))
-    assert error.completeness.tolist() == [1.0]
-    assert error.accuracy.tolist() == [1.0]
-
-
 @settings(max_examples=15)
 @given(st.integers(0, 10_000), st.integers(1, 30), st.integers(0, 30))
 def test_against_all_distances_and_its_laws(seed: int, num_true: int, num_estimated: int) -> None:

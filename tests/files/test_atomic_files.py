@@ -13,7 +13,6 @@ import pytest
 from directshape_torch.errors import InputError
 from directshape_torch.files import atomic_files
 from directshape_torch.files.array_files import write_npz
-from directshape_torch.io.image_files import read_rgb, read_single_channel
 
 
 def test_a_failed_replacement_keeps_the_old_file_and_leaves_no_temporary(
@@ -83,16 +82,6 @@ def test_json_is_sorted_and_refuses_nan(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "a.json").read_text()) == {"a": [2.5], "b": 1}
     with pytest.raises(ValueError, match="not JSON compliant"):
         atomic_files.write_json(tmp_path / "b.json", {"a": float("nan")})
-
-
-def test_png_round_trip_keeps_channel_order_and_16_bits(tmp_path: Path) -> None:
-    rgb = np.zeros((4, 5, 3), np.uint8)
-    rgb[..., 0] = 200  # red
-    atomic_files.write_png(tmp_path / "rgb.png", rgb)
-    np.testing.assert_array_equal(read_rgb(tmp_path / "rgb.png"), rgb)
-    ids = np.array([[0, 26001], [1002, 65535]], np.uint16)
-    atomic_files.write_png(tmp_path / "ids.png", ids)
-    np.testing.assert_array_equal(read_single_channel(tmp_path / "ids.png"), ids)
 
 
 def test_where_a_broken_link_stands_no_folder_can_be_made(tmp_path: Path) -> None:

@@ -2,19 +2,9 @@
 
 from __future__ import annotations
 
-import unicodedata
 from pathlib import Path
 
-import pytest
-
 from directshape_torch.files.find_files import found, visible_files
-
-
-@pytest.mark.parametrize("name", ["000000.PNG", "000000.Png", "000000.png"])
-def test_endings_in_capitals(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).touch()
-    assert found(tmp_path / "000000.png") == tmp_path / name
-    assert visible_files(tmp_path, [".png"]) == [tmp_path / name]
 
 
 def test_the_very_name_wins_and_stems_keep_their_capitals(tmp_path: Path) -> None:
@@ -24,14 +14,6 @@ def test_the_very_name_wins_and_stems_keep_their_capitals(tmp_path: Path) -> Non
     assert found(tmp_path / "a.PNG") == tmp_path / "a.PNG"
     assert found(tmp_path / "b.png") is None
     assert found(tmp_path / "nowhere" / "a.png") is None
-
-
-@pytest.mark.parametrize("form", ["NFC", "NFD"])
-def test_accents_may_be_written_either_way(tmp_path: Path, form: str) -> None:
-    name = unicodedata.normalize(form, "Straße_é 01.png")
-    (tmp_path / name).touch()
-    for other in ("NFC", "NFD"):
-        assert found(tmp_path / unicodedata.normalize(other, "Straße_é 01.png")) == tmp_path / name
 
 
 def test_hidden_files_and_folders_are_none_and_links_are_files(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import torch
 from helpers.synthetic_scene import cached_street
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from public_calls import at, calls, changed, odd_call, odd_numbers, whole_call
+from public_calls import OddCall, at, calls, odd_call, odd_numbers, whole_call
 from tensor_values import MUTATIONS
 
 from directshape_torch import Detections, DirectShapeRefiner
@@ -28,12 +28,6 @@ MASKS = ("mask_left", "mask_right")
 REFINE = calls()["refine"]
 
 
-def refine(place: tuple[str, ...], value: object) -> None:
-    parts = dict(REFINE.arguments)
-    parts[place[0]] = changed(parts[place[0]], place[1:], value)
-    REFINE.run(parts)
-
-
 @pytest.mark.parametrize("place", [place for place in REFINE.places() if len(place) > 1], ids=".".join)
 def test_other_things_than_dense_tensors_of_the_right_type_are_named(place: tuple[str, ...]) -> None:
     good = at(REFINE.arguments[place[0]], place[1:])
@@ -46,7 +40,7 @@ def test_other_things_than_dense_tensors_of_the_right_type_are_named(place: tupl
             continue
         # The first tensor of a record says what the others should be, so that one of them may be named in its place.
         with pytest.raises(InputError, match=r"^[\w.]+: expected .*, got ") as caught:
-            refine(place, value)
+            OddCall(name, REFINE, place, value, False).outcome()
         assert len(str(caught.value)) < 500
 
 

@@ -24,10 +24,13 @@ def _remembered(match: Callable[..., Any]) -> Callable[..., Any]:
     return answered
 
 
+_match_pair, _match_disparity = _remembered(check_images.match_pair), _remembered(check_lidar.match_disparity)
+
+
 @contextmanager
 def matched_once() -> Iterator[None]:
-    """The checks of scenes match equal images once while the body runs."""
+    """The checks of scenes match equal images once while the body runs, and not again in a later body."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(check_images, "match_pair", _remembered(check_images.match_pair))
-        patch.setattr(check_lidar, "match_disparity", _remembered(check_lidar.match_disparity))
+        patch.setattr(check_images, "match_pair", _match_pair)
+        patch.setattr(check_lidar, "match_disparity", _match_disparity)
         yield

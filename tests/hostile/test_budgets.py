@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from directshape_torch.errors import ConfigError, DataFormatError, DirectShapeError
@@ -80,7 +81,10 @@ def test_images(tmp_path: Path, content: bytes) -> None:
 def archive(compression: int = zipfile.ZIP_DEFLATED, encrypted: bool = False, zeros: int = 100) -> bytes:
     """An npz of zeros."""
     content = io.BytesIO()
-    with zipfile.ZipFile(content, "w", compression) as file, file.open("a.npy", "w", force_zip64=True) as entry:
+    with (
+        zipfile.ZipFile(content, "w", compression, compresslevel=1) as file,
+        file.open("a.npy", "w", force_zip64=True) as entry,
+    ):
         np.lib.format.write_array_header_1_0(entry, {"descr": "|u1", "fortran_order": False, "shape": (zeros,)})
         for start in range(0, zeros, 2**24):
             entry.write(bytes(min(2**24, zeros - start)))
@@ -124,8 +128,6 @@ def test_archives(tmp_path: Path, made: dict[str, Any], problem: str) -> None:
     ids=str,
 )
 def test_networks(tmp_path: Path, changes: dict[str, Any]) -> None:
-    from safetensors import safe_open
-
     asset, path = Path(priors.__file__).parents[1] / "assets" / "neural_prior.safetensors", tmp_path / "a.safetensors"
     with safe_open(asset, framework="pt") as file:
         description = {**json.loads(file.metadata()["description"]), **changes}

@@ -93,7 +93,6 @@ def test_files_of_other_formats(tmp_path: Path, name: str, content: bytes) -> No
 
 
 def test_no_other_file_is_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither materials nor pictures."""
     material, mesh = tmp_path / "a.mtl", tmp_path / "a.obj"
     material.write_text("newmtl a\nmap_Kd a.png\n")
     mesh.write_text("mtllib a.mtl\nusemtl a\n" + "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS) + "f 1 2 3\n")

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 from helpers import quick_runs
-from helpers.kitti_folder import FRAMES, write_data_set
+from helpers.kitti_folder import FRAMES, input_options, write_data_set
 from helpers.quick_runs import result_files
 
 import directshape_torch
@@ -41,7 +41,7 @@ def undisturbed(shared_kitti: Path, tmp_path_factory: pytest.TempPathFactory) ->
 def test_a_worker_that_is_killed_as_it_starts(
     shared_kitti: Path, tmp_path: Path, undisturbed: Path, delay_s: float
 ) -> None:
-    """Before they have read the job, which is larger than a pipe holds."""
+    """The worker dies before it has read the job, which is larger than a pipe holds."""
     killed: list[int] = []
 
     def kill() -> None:
@@ -132,9 +132,8 @@ def test_frames_of_records_that_no_run_has_written(
 def test_a_run_that_is_asked_to_end_says_so(tmp_path: Path) -> None:
     root, out = tmp_path / "kitti", tmp_path / "out"
     write_data_set(root, tuple(f"{number:06d}" for number in range(16)))
-    command = [sys.executable, "-m", "directshape_torch", "refine", "--data", str(root), "--out", str(out)]
-    command += ["--detections", str(root / "detections"), "--masks", str(root / "masks")]
-    command += ["--prior", str(root / "prior.safetensors"), "--rig", "none", "--threads", "1"]
+    command = [sys.executable, "-m", "directshape_torch", "refine", *input_options(root), "--out", str(out)]
+    command += ["--rig", "none", "--set", "check=off", "--threads", "1"]
     package = str(Path(directshape_torch.__file__).parent.parent)
     run = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": package}, stderr=subprocess.PIPE, text=True)
     try:

@@ -145,11 +145,7 @@ def test_damaged_rig(root: Path, path: str, value: object, message: str) -> None
         ("objects.0", "Car", r"objects\[0\] expected an object, got 'Car'"),
         ("objects.0.class", "a car", r"objects\[0\].class is 'a car', expected one word"),
         ("objects.0.rotation_y_rad", ..., r"objects\[0\]: a 3D box needs rotation_y_rad too"),
-        (
-            "objects.0.bottom_center_m",
-            [0, 1],
-            r"objects\[0\].bottom_center_m: expected a list of 3 or nothing",
-        ),
+        ("objects.0.bottom_center_m", [0, 1], r"objects\[0\].bottom_center_m: expected a list of 3 or nothing"),
         ("objects.0.dimensions_hwl_m", [1, 0, 4], "expected lengths above 0"),
         ("objects.0.score", None, "score: expected float, got None"),
         ("objects.1.yaw", 1.0, r"objects\[1\].'yaw' is unknown"),

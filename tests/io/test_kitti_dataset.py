@@ -92,21 +92,6 @@ def test_a_mask_in_one_image_only_and_none_at_all(root: Path) -> None:
     assert not without.has_mask_right.any()
 
 
-def test_right_mask_of_a_hidden_car_is_found_by_way_of_the_left_one(root: Path) -> None:
-    """Two fifths of the car show in both images, and nothing else has a mask."""
-    masks = open_dataset("kitti", root, root / "training" / "label_2", root / "masks").load("000000").detections
-    parts = {}
-    for side, mask in (("left", masks.mask_left[0]), ("right", masks.mask_right[0])):
-        v, u = np.nonzero(mask.numpy() > 0.5)
-        whole = (float(u.min()), float(v.min()), float(u.max()), float(v.max()))
-        parts[side] = instance(side, (*whole[:2], whole[0] + 0.4 * (whole[2] - whole[0]), whole[3]), 9)
-        if side == "left":
-            parts[side]["bbox"] = [*whole[:2], whole[2] - whole[0] + 1, whole[3] - whole[1] + 1]
-    write_masks(root, [parts["left"], parts["right"]])
-    exact = open_dataset("kitti", root, root / "training" / "label_2", root / "masks")
-    assert instances(exact, exact.load("000000")) == ([9, -1], [9, -1])
-
-
 def test_other_instances_are_occluders_with_the_depth_of_a_detection_of_their_class(root: Path) -> None:
     write_masks(root, [*read_masks(root), instance("left", WALKER_BOX, 7, category=1)])
     occluders = dataset(root).load("000000").detections.occluders
@@ -185,6 +170,7 @@ def cut(path: Path) -> None:
         (lambda root: (root / "training/image_2/000000.png").unlink(), r"image_2/000000\.png: cannot be read"),
         (lambda root: (root / "training/calib/000000.txt").write_text("P2: 1\n"), r"calib/000000\.txt, line 1: exp"),
         (lambda root: cut(root / "detections/data/000000.txt"), r"000000\.txt, line 1: expected 15 or 16 columns"),
+        (lambda root: cut(root / "training/label_2/000000.txt"), r"label_2/000000\.txt, line 1: expected 15 columns"),
         (lambda root: (root / "masks/000000.json").unlink(), r"masks/000000\.json: cannot be read"),
         (
             lambda root: write_png(root / "training/image_3/000000.png", np.zeros((120, 100, 3), np.uint8)),

@@ -54,10 +54,3 @@ def test_dont_care_has_no_3d_box(tmp_path: Path) -> None:
 def test_bad_lines_name_file_number_and_text(tmp_path: Path, line: str, is_label: bool, message: str) -> None:
     with pytest.raises(DataFormatError, match=message):
         read_objects(write(tmp_path, f"{LABEL}\n{line}\n"), is_label)
-
-
-def test_binary_file(tmp_path: Path) -> None:
-    path = tmp_path / "a.txt"
-    path.write_bytes(b"Car \xff\xfe")
-    with pytest.raises(DataFormatError, match="is not UTF-8 text"):
-        read_objects(path)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import write_png
-from directshape_torch.io.instance_masks import InstanceMask, decode_segmentation
+from directshape_torch.io.instance_masks import decode_segmentation
 from directshape_torch.io.mask_files import CocoFileMasks, FrameJsonMasks, InstancePngMasks, mask_source
 
 SIZE_HW = (6, 9)
@@ -72,13 +72,10 @@ def test_compressed_masks_of_any_content_pass_the_check(seed: int, height: int, 
     [
         (7, "entry 7: 'segmentation' is neither RLE nor a list of polygons"),
         ([["a", "b"]], "neither RLE nor a list"),
-        ({"size": [6, 9], "counts": [25.5, 28.5]}, "bad run lengths"),
         ({"size": [6, 9], "counts": [25, 3]}, "entry 7: run lengths cover 28 pixels, expected 6 x 9 = 54"),
         ({"size": [6, 9], "counts": encoded(MASK)[:-2]}, r"entry 7: run lengths cover \d+ pixels"),
         ({"size": [6, 9], "counts": "~~"}, "entry 7: bad run lengths .*'~' is not part"),
         ({"size": [6, 9], "counts": "o"}, "ends inside a number"),
-        ({"size": [6], "counts": RUNS}, "bad run lengths"),
-        ({"size": [6, 9], "counts": 5.5}, "bad run lengths"),
     ],
 )
 def test_bad_segmentations(segmentation: Any, message: str) -> None:
@@ -90,7 +87,7 @@ def test_bad_segmentations(segmentation: Any, message: str) -> None:
 def test_frame_json(tmp_path: Path, folder: str) -> None:
     entries = [
         entry(image="left", instance_id=7, bbox=[3, 1, 4, 3], score=0.25),
-        entry(image="right", category_id=1),
+        entry(image="right", category_id=1, score=None),
     ]
     write_json(tmp_path / folder / "000004.json", entries)
     left, right = mask_source(tmp_path).read("000004", SIZE_HW)
@@ -120,7 +117,6 @@ def test_soft_probability_replaces_the_binary_mask(tmp_path: Path) -> None:
     "nothing", [{"size": [6, 9], "counts": [54]}, [], [[]], None, [[1, 1, 3, 3]], [[1, 1, 3, 3, 5]], [[], [2, 2]]]
 )
 def test_an_empty_mask_is_no_instance_and_harms_no_other(tmp_path: Path, nothing: Any) -> None:
-    """Tools write such entries for what has no area."""
     write_json(tmp_path / "000000.json", [entry(image="left", segmentation=nothing), entry(image="left")])
     (mask,) = FrameJsonMasks(tmp_path).read("000000", SIZE_HW)
     assert mask.mask_box == (4, 1, 5, 3)
@@ -208,14 +204,6 @@ def test_a_street_without_instances_shows_no_car(tmp_path: Path, numbers: tuple[
     assert sum(mask.is_car for mask in mask_source(tmp_path).read("000000", SIZE_HW)) == cars
 
 
-def test_an_instance_keeps_no_more_than_its_part_of_the_image() -> None:
-    image = np.where(MASK, np.float32(0.7), np.float32(0))
-    mask = InstanceMask.found("left", 1, True, image)
-    assert mask is not None
-    assert mask.probability.shape < SIZE_HW
-    assert not np.shares_memory(mask.probability, image)
-
-
 def test_instance_png_of_8_bits_is_refused_and_an_empty_one_is_not(tmp_path: Path) -> None:
     write_png(tmp_path / "instance_2" / "000000.png", np.where(MASK, 3, 0).astype(np.uint8))
     with pytest.raises(DataFormatError, match=r"has 8 bits and numbers up to 3, where class \* 1000 .*; write 16 bits"):
@@ -236,13 +224,8 @@ def test_instance_png_of_the_left_images_alone(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", [0.5, True, "x", None, [1]])
 def test_an_image_id_that_is_no_number_of_a_frame_is_named(tmp_path: Path, number: Any) -> None:
     path = write_json(tmp_path / "l.json", [entry(image_id=number)])
-    with pytest.raises(DataFormatError, match=r"entry 0: 'image_id' is .*, expected the frame's number"):
+    with pytest.raises(DataFormatError, match=r"l\.json: entry 0: 'image_id' is .*, expected the frame's number"):
         CocoFileMasks(path, None).read("000001", SIZE_HW)
-
-
-def test_a_score_that_is_null_is_none(tmp_path: Path) -> None:
-    write_json(tmp_path / "000000.json", [entry(image="left", score=None)])
-    assert [mask.score for mask in FrameJsonMasks(tmp_path).read("000000", SIZE_HW)] == [1.0]
 
 
 def test_plain_coco_files_of_a_whole_data_set(tmp_path: Path) -> None:
@@ -256,9 +239,6 @@ def test_plain_coco_files_of_a_whole_data_set(tmp_path: Path) -> None:
 
 
 def test_plain_coco_files_that_do_not_fit(tmp_path: Path) -> None:
-    source = CocoFileMasks(write_json(tmp_path / "l.json", [entry()]), None)
-    with pytest.raises(DataFormatError, match=r"l\.json: entry 0: 'image_id' is None, expected the frame's number"):
-        source.read("000107", SIZE_HW)
     source = CocoFileMasks(write_json(tmp_path / "k.json", []), None)
     with pytest.raises(InputError, match=r"frame_id: expected a number.*'first'"):
         source.read("first", SIZE_HW)

@@ -101,7 +101,6 @@ def test_assignment_equals_the_best_of_all(seed: int, num_detections: int, num_m
 
 @pytest.mark.parametrize("box_2d", [None, NO_BOX, (0.0,) * 4, (0.0, 0.0, 50.0, 50.0), (400.0, 300.0, 100.0, 50.0)])
 def test_boxes_of_the_file_are_not_needed(box_2d: Box | None) -> None:
-    """What LiDAR detectors and label tools write where they have no 2D box."""
     cars = [car(1, -4.0, 15.0, box_2d), car(2, 3.0, 20.0, box_2d)]
     masks = [seen(x, z, side, n) for n, (x, z) in ((7, (3.0, 20.0)), (8, (-4.0, 15.0))) for side in ("left", "right")]
     found = matched(cars, masks)  # type: ignore[arg-type]

@@ -66,7 +66,6 @@ def test_endings_in_capitals_are_read(kitti_copy: Path, change: object) -> None:
 @pytest.mark.parametrize("name", ["frame.0001", "Straße 07 é", "日本 1", "a b 1", "x" * 150 + "1"])
 @pytest.mark.parametrize("form", ["NFC", "NFD"])
 def test_names_are_kept_as_the_user_gave_them(kitti_copy: Path, name: str, form: str) -> None:
-    """Images copied by one system, detections by another."""
     first = opened(kitti_copy).frame_ids[0]
     for path in list(kitti_copy.rglob(f"{first}.*")):
         of_detections = "detections" in path.parts

@@ -8,7 +8,6 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from helpers.layouts import (
@@ -27,7 +26,6 @@ from helpers.layouts import (
 from helpers.matched_masks import instances
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.io.kitti_calibration import read_calibration
 from directshape_torch.io.stereo_dataset import LayoutName, LoadedFrame, StereoDataset, open_dataset
 
 FRAMES = ("000000", "000001")
@@ -97,13 +95,18 @@ def test_one_tracking_sequence(kitti: Path, tmp_path: Path, expected: LoadedFram
     assert [label.location_ref for label in labels] == [label.location_ref for label in expected.labels]
 
 
-def test_tracking_benchmark_with_one_result_file_a_sequence(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
+@pytest.mark.parametrize("split", ["training", "testing"])
+def test_tracking_benchmark_with_one_result_file_a_sequence(
+    kitti: Path, tmp_path: Path, expected: LoadedFrame, split: str
+) -> None:
     write_sequence(kitti, tmp_path, FRAMES, single=False)
+    (tmp_path / "training").rename(tmp_path / split)
     _, masks = renamed(kitti, tmp_path, (f"{SEQUENCE}/000000", f"{SEQUENCE}/000001"))
     write_tracked(kitti / "detections" / "data", FRAMES, tmp_path / "results" / f"{SEQUENCE}.txt")
-    dataset = open_dataset("tracking", tmp_path, tmp_path / "results", masks, dtype=torch.float64)
-    assert dataset.frame_ids == (f"{SEQUENCE}_000000", f"{SEQUENCE}_000001")
-    assert_same(dataset, f"{SEQUENCE}_000001", expected)
+    for root in (tmp_path, tmp_path / split):
+        dataset = open_dataset("tracking", root, tmp_path / "results", masks, dtype=torch.float64)
+        assert dataset.frame_ids == (f"{SEQUENCE}_000000", f"{SEQUENCE}_000001")
+        assert_same(dataset, f"{SEQUENCE}_000001", expected)
     dataset.objects(f"{SEQUENCE}_000001").clear()  # a list of the caller's own
     # Results name what they came from, without the frame and the track.
     assert dataset.objects(f"{SEQUENCE}_000001")[0].raw_line == expected.input_objects[0].raw_line
@@ -113,7 +116,6 @@ def test_tracking_benchmark_with_one_result_file_a_sequence(kitti: Path, tmp_pat
 
 
 def test_tracking_frames_called_by_sequence_in_one_folder(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
-    """As a refinement writes its results, which may be refined again."""
     write_sequence(kitti, tmp_path, FRAMES, single=False)
     detections, masks = renamed(kitti, tmp_path, (f"{SEQUENCE}_000000", f"{SEQUENCE}_000001"))
     dataset = open_dataset("tracking", tmp_path, detections, masks, dtype=torch.float64)
@@ -125,22 +127,11 @@ def test_tracking_frames_called_by_sequence_in_one_folder(kitti: Path, tmp_path:
 
 @pytest.mark.parametrize("where", ["testing", "training/../testing", "."])
 def test_the_object_benchmark_without_a_training_folder(kitti_copy: Path, expected: LoadedFrame, where: str) -> None:
-    """The folder `testing`, alone below the root or named by itself."""
     (kitti_copy / "training").rename(kitti_copy / "testing")
     (kitti_copy / "training").mkdir()
     root = kitti_copy / where
     dataset = open_dataset("kitti", root, kitti_copy / "detections", kitti_copy / "masks", dtype=torch.float64)
     assert_same(dataset, "000001", expected)
-
-
-def test_the_testing_split_of_the_tracking_benchmark(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
-    write_sequence(kitti, tmp_path, FRAMES, single=False)
-    (tmp_path / "training").rename(tmp_path / "testing")
-    _, masks = renamed(kitti, tmp_path, (f"{SEQUENCE}/000000", f"{SEQUENCE}/000001"))
-    write_tracked(kitti / "detections" / "data", FRAMES, tmp_path / "results" / f"{SEQUENCE}.txt")
-    for root in (tmp_path, tmp_path / "testing"):
-        dataset = open_dataset("tracking", root, tmp_path / "results", masks, dtype=torch.float64)
-        assert_same(dataset, f"{SEQUENCE}_000001", expected)
 
 
 @pytest.mark.parametrize("root", ["", "dataset"])
@@ -159,15 +150,6 @@ def test_odometry(kitti: Path, tmp_path: Path, expected: LoadedFrame, root: str)
         "odometry", tmp_path / root / "sequences" / "04", detections / "04", masks / "04", dtype=torch.float64
     )
     assert_same(one, "000001", expected)
-
-
-def test_the_scanner_of_odometry_is_placed_by_one_matrix(kitti: Path, tmp_path: Path) -> None:
-    write_odometry(kitti, tmp_path, FRAMES)
-    calibration = read_calibration(tmp_path / "sequences" / "04" / "calib.txt")
-    assert calibration.R0_rect is not None
-    assert calibration.Tr_velo_to_cam is not None
-    assert calibration.R0_rect.tolist() == np.eye(3).tolist()
-    assert calibration.Tr_velo_to_cam[:, 3].tolist() == [0.1, -0.2, -0.3]
 
 
 @pytest.mark.parametrize(
@@ -264,7 +246,6 @@ def test_folder(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
 
 
 def test_a_mask_stays_with_its_object_wherever_it_is(kitti: Path, tmp_path: Path) -> None:
-    """Two objects with each other's masks: overlap would set that right, the file is believed."""
     write_folder(kitti, tmp_path, FRAMES)
     path = tmp_path / "frames" / "000000.json"
     content = json.loads(path.read_text())

@@ -1,23 +1,21 @@
-"""Results are read back as refined boxes, and shape files are read back or refused."""
+"""Results are read back as refined boxes, and files that are damaged or do not belong together are refused."""
 
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.finished_run import FinishedRun
 from helpers.shape_arrays import shape_arrays
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.array_files import write_npz
 from directshape_torch.io.kitti_labels import read_objects
-from directshape_torch.io.result_files import (
-    ShapeArrays,
-    read_shapes,
-    write_result_text,
-    write_shapes,
-)
+from directshape_torch.io.result_files import ShapeArrays, read_shapes, write_result_text, write_shapes
+from directshape_torch.io.run_folder import RunFolder
 
 CAR = "Car -1.00 -1 -2.2941 766.19 174.53 1241.00 374.00 1.5047 1.6292 4.0765 2.4780 1.5201 4.3034 -1.7716 0.90000"
 WALKER = "Pedestrian  0 0 0.5 1 2 3 4 1.8 0.6 0.6 1 1.7 9 0 1e-3\t"
@@ -81,3 +79,11 @@ def test_files_that_are_no_shapes(tmp_path: Path) -> None:
     write_npz(path, {"schema_version": np.array(5), "codes": np.zeros(3)})
     with pytest.raises(DataFormatError, match="has been changed since it was written"):
         read_shapes(path)
+
+
+def test_files_that_do_not_fit_together_are_named(finished: FinishedRun, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(finished.out, tmp_path / "out"))
+    result = out / "data" / "000000.txt"
+    result.write_text("".join(result.read_text().splitlines(keepends=True)[:1]))
+    with pytest.raises(DataFormatError, match=r"data/000000.txt: has been changed, or does not belong to .*npz"):
+        RunFolder(out).read("000000")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.kitti_folder import write_data_set
-from helpers.layouts import DAY, DRIVE, SEQUENCE, put, write, write_raw, write_sequence
+from helpers.layouts import DAY, DRIVE, SEQUENCE, put, write, write_odometry, write_raw, write_sequence
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.kitti_calibration import read_velo_to_cam
@@ -33,38 +33,37 @@ def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def check_scan(kitti: Path, layout: LayoutName, root: Path, frame_id: str, to: Path) -> None:
-    """Write detections and scan of the frame under its name in the layout, and check the scan."""
-    put(kitti / "detections" / "data" / f"{FRAME}.txt", to / "found" / f"{frame_id}.txt")
-    put(kitti / "training" / "velodyne" / f"{FRAME}.bin", to / "scans" / f"{frame_id}.bin")
-    dataset = open_dataset(layout, root, to / "found", lidar_dir=to / "scans")
-    points_cam, camera = dataset.scan(frame_id)
-    expected = torch.tensor([[0.1, -0.2, 9.7], [-1.9, -0.7, 19.7]]).double() + camera.t_cam_ref[0]
-    torch.testing.assert_close(points_cam, expected, atol=1e-6, rtol=0)
-    assert all(path.is_file() for role, path in dataset.input_files(frame_id).items() if role.startswith("lidar"))
-
-
-def test_kitti(kitti: Path, tmp_path: Path) -> None:
-    check_scan(kitti, "kitti", kitti, FRAME, tmp_path)
-
-
-@pytest.mark.parametrize("single", [True, False])
-def test_tracking(kitti: Path, tmp_path: Path, single: bool) -> None:
-    write_sequence(kitti, tmp_path, (FRAME,), single)
-    check_scan(kitti, "tracking", tmp_path, FRAME if single else f"{SEQUENCE}_{FRAME}", tmp_path)
-
-
-@pytest.mark.parametrize("single", [True, False])
-def test_raw(kitti: Path, tmp_path: Path, single: bool) -> None:
-    drive = write_raw(kitti, tmp_path, (FRAME,))
+def written(kitti: Path, layout: LayoutName, root: Path, is_single: bool) -> tuple[Path, str]:
+    """The folder of the frame in the layout, alone or below its benchmark, and its name there."""
+    if layout == "kitti":
+        return kitti, FRAME
+    if layout == "tracking":
+        write_sequence(kitti, root, (FRAME,), is_single)
+        return root, FRAME if is_single else f"{SEQUENCE}_{FRAME}"
+    if layout == "odometry":
+        write_odometry(kitti, root, (FRAME,))
+        return (root / "sequences" / "04", FRAME) if is_single else (root, f"04_{FRAME}")
+    drive = write_raw(kitti, root, (FRAME,))
     # Beside the other calibration, which says nothing of the scanner.
     calibration = drive.parent / "calib_cam_to_cam.txt"
     lines = [line for line in calibration.read_text().splitlines(keepends=True) if "Tr_velo" not in line]
     calibration.write_text("".join(lines))
     place = f"calib_time: 15-Mar-2012 11:37:16\nR: {ROTATION}\nT: {TRANSLATION}\n"
     write(drive.parent / "calib_velo_to_cam.txt", place)
-    frame_id = "0000000000" if single else f"{DRIVE}_0000000000"
-    check_scan(kitti, "raw", drive if single else tmp_path / DAY, frame_id, tmp_path)
+    return (drive, "0000000000") if is_single else (root / DAY, f"{DRIVE}_0000000000")
+
+
+@pytest.mark.parametrize("is_single", [True, False], ids=["alone", "of a benchmark"])
+@pytest.mark.parametrize("layout", ["kitti", "tracking", "odometry", "raw"])
+def test_a_scan_of_each_layout(kitti: Path, tmp_path: Path, layout: LayoutName, is_single: bool) -> None:
+    root, frame_id = written(kitti, layout, tmp_path, is_single)
+    put(kitti / "detections" / "data" / f"{FRAME}.txt", tmp_path / "found" / f"{frame_id}.txt")
+    put(kitti / "training" / "velodyne" / f"{FRAME}.bin", tmp_path / "scans" / f"{frame_id}.bin")
+    dataset = open_dataset(layout, root, tmp_path / "found", lidar_dir=tmp_path / "scans")
+    points_cam, camera = dataset.scan(frame_id)
+    expected = torch.tensor([[0.1, -0.2, 9.7], [-1.9, -0.7, 19.7]]).double() + camera.t_cam_ref[0]
+    torch.testing.assert_close(points_cam, expected, atol=1e-6, rtol=0)
+    assert all(path.is_file() for role, path in dataset.input_files(frame_id).items() if role.startswith("lidar"))
 
 
 def test_place_of_a_scanner(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from parametric_cars import surfaces as cars
 from parametric_cars.measures import BODY_TYPES, sample_car
-from parametric_cars.surfaces import polygon_distance
 
 from directshape_torch.errors import InputError
 
@@ -36,13 +35,6 @@ def test_signed_distance_is_that_to_the_mesh():
     assert cars.car_sdf(parameters, far)[0] == pytest.approx(5.0 - 0.5 * parameters.length, abs=0.1)
 
 
-def test_seed_decides_everything():
-    assert sample_car(11) == sample_car(11)
-    assert sample_car(11) != sample_car(12)
-    rng = np.random.default_rng(3)
-    assert sample_car(rng) != sample_car(rng)
-
-
 def test_dimensions_of_the_traffic_are_those_of_labelled_cars():
     # KITTI: height 1.53 +- 0.14, width 1.63 +- 0.10, length 3.88 +- 0.43 m.
     drawn = np.array([[c.height, c.width, c.length] for c in (sample_car(k) for k in range(600))])
@@ -63,12 +55,6 @@ def test_parts_lie_where_they_belong():
     assert height[labels == cars.TYRE].max() < 2 * parameters.wheel_radius + 0.05
     ends = np.abs(mesh.vertices[labels == cars.PLATE][:, 0])
     assert ends.min() > 0.4 * parameters.length
-
-
-def test_polygon_distance_by_hand():
-    square = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
-    points = np.array([[1.0, 1.0], [1.0, 0.25], [3.0, 1.0], [5.0, 6.0]])
-    np.testing.assert_allclose(polygon_distance(points, square), [-1.0, -0.25, 1.0, 5.0])
 
 
 def test_wrong_input():

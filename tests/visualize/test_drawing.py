@@ -38,14 +38,6 @@ def black(width: int = 101, height: int = 81) -> View:
     return View(np.zeros((height, width, 3), np.uint8), P)
 
 
-def test_silhouette_of_a_square() -> None:
-    # 1 m at 10 m with f = 100 px: 10 px around the principal point (50, 40).
-    mask = silhouette_mask(black(), mesh(SQUARE))
-    rows, columns = np.nonzero(mask)
-    assert (columns.min(), columns.max(), rows.min(), rows.max()) == (40, 60, 30, 50)
-    assert mask[30:51, 40:61].all()
-
-
 def test_triangles_behind_the_camera_are_left_out() -> None:
     behind = mesh(SQUARE - np.array([0, 0, 20]))
     assert not silhouette_mask(black(), behind).any()

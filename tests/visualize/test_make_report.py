@@ -13,11 +13,10 @@ import pytest
 from helpers.finished_run import FinishedRun, unpacked
 from helpers.quick_runs import refine
 
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.errors import DataFormatError
 from directshape_torch.evaluation.comparison import compare_results
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import RunFolder
-from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.visualize.make_report import ReportOutcome, make_report
 from directshape_torch.visualize.run_frames import RunInputs
 
@@ -142,11 +141,6 @@ def test_detections_are_looked_for_in_all_frames_and_images_where_there_are_pict
     assert "left image not found (1 frame)" in outcome.notes
     of_detections = [note for note in outcome.notes if note.startswith("detections")]
     assert of_detections == ["detections not used: the file has changed since the run (2 frames)"]
-
-
-def test_another_prior_is_refused(finished: FinishedRun) -> None:
-    with pytest.raises(InputError, match="the prior of the run"):
-        RunInputs(finished.folder(), PCAShapePrior.load_bundled(), finished.dataset)
 
 
 def test_few_frames_have_details(finished: FinishedRun, tmp_path: Path) -> None:

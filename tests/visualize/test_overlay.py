@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,14 +13,7 @@ from helpers.bundled_frame import BOXES, DEMO, MASKS
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.synthetic_scene import cached_street, disturbed, joined_frames
 
-from directshape_torch import (
-    Detections,
-    DirectShapeRefiner,
-    FrameBatch,
-    InputError,
-    RefinementResult,
-    load_config,
-)
+from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, InputError, RefinementResult, load_config
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.status import Status
@@ -93,6 +87,7 @@ def test_far_truth_is_left_out_of_the_scale() -> None:
     np.testing.assert_array_equal(with_far[150:], plain[150:])
 
 
+@cache
 def call_of_two_frames() -> tuple[FrameBatch, Detections, RefinementResult]:
     """The street twice, its second car in the second frame; the first frame has no masks and is not refined."""
     prior, street = cached_street()

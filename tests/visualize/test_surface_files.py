@@ -213,7 +213,6 @@ def test_equal_runs_give_equal_bytes(finished: FinishedRun, exported: Path, tmp_
 
 
 def test_a_frame_without_refined_cars_has_no_surfaces(finished: FinishedRun, tmp_path: Path) -> None:
-    """The scene is the ground alone, and without images there is nothing to write."""
     out = Path(shutil.copytree(finished.out, tmp_path / "out"))
     path = out / "shapes" / "000000.npz"
     write_shapes(path, replace(read_shapes(path), statuses=("no_mask", "singular")))
