@@ -74,7 +74,7 @@ def add_layout_options(group: argparse._ActionsContainer, required: bool = False
         help="of the files below ROOT (docs/inputs.md): KITTI's object benchmark (default), a raw drive or day of "
         "drives, a tracking or odometry sequence or all of them, Stereo 2015, or a plain folder with JSON",
     )
-    group.add_argument("--frames", nargs="+", metavar="ID", help="only these frames, e.g. 107 7322")
+    group.add_argument("--frames", nargs="+", metavar="ID", type=frame_id_of, help="only these frames, e.g. 107 7322")
     group.add_argument("--classes", nargs="+", default=["Car"], metavar="NAME", help="types to refine (default: Car)")
 
 
@@ -129,7 +129,7 @@ def add_frame_choice(parser: argparse.ArgumentParser, default: str) -> None:
     """Add `--split` and `--frames`; `default` says which frames are used without them."""
     chosen = parser.add_mutually_exclusive_group()
     chosen.add_argument("--split", type=Path, metavar="FILE", help=f"a frame a line; default: {default}")
-    chosen.add_argument("--frames", nargs="+", metavar="ID", help="only these frames, e.g. 107 7322")
+    chosen.add_argument("--frames", nargs="+", metavar="ID", type=frame_id_of, help="only these frames, e.g. 107 7322")
 
 
 def add_interval_options(parser: argparse.ArgumentParser) -> None:
@@ -158,6 +158,11 @@ def dataset_of(args: argparse.Namespace) -> StereoDataset:
         lidar_dir=getattr(args, "lidar", None),
         tracks=getattr(args, "tracks", False),
     )
+
+
+def frame_id_of(word: str) -> int | str:
+    """A frame number, which may have leading zeros, or the whole name of a frame."""
+    return int(word) if word.isdecimal() else word
 
 
 def mask_source(args: argparse.Namespace) -> MaskSource | Path | None:

@@ -73,7 +73,6 @@ TARGETS: dict[str, Target] = {
             "height_prior",
             "tilt_prior_normal",
             "tilt_prior_cosine",
-            "_by_rotation",
             "dimensions_prior",
             "pose_prior",
             "rig_prior",
