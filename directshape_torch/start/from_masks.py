@@ -123,7 +123,7 @@ def _placed(
     for first in range(0, len(xz), _PORTION):
         fits.append(fit_rectangles(InstancePoints(*(each[first : first + _PORTION] for each in of_instances))))
     place, cost = (torch.cat(column) for column in zip(*fits, strict=True))
-    cost, order = cost.nan_to_num(nan=math.inf).sort(dim=1, stable=True)
+    cost, order = cost.nan_to_num(nan=math.inf, posinf=math.inf).sort(dim=1, stable=True)
     return place.gather(1, order[..., None].expand_as(place)), cost
 
 

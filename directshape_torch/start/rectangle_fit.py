@@ -72,7 +72,7 @@ def fit_rectangles(seen: InstancePoints) -> tuple[Tensor, Tensor]:
         (M, C), square metres.
     """
     place, cost = _improved(_starts(seen), seen)
-    _, kept = cost.nan_to_num(nan=math.inf).topk(_NUM_KEPT, dim=1, largest=False)
+    _, kept = cost.nan_to_num(nan=math.inf, posinf=math.inf).topk(_NUM_KEPT, dim=1, largest=False)
     return _improved(place.gather(1, kept[..., None].expand(-1, -1, place.shape[-1])), seen)
 
 

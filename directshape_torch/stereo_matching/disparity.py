@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -21,12 +20,12 @@ LEAST_HEIGHT_M = 0.4
 _BLOCK_SIZE_PX = 5
 _UNIQUENESS_PERCENT = 10
 _FRACTION = 16  # OpenCV counts disparity in sixteenths of a pixel
-_NUM_DISPARITIES = 192  # disparities up to this are searched
+_NUM_DISPARITIES = 192  # disparities below this are searched
 _STEP = 16  # OpenCV takes multiples of this number of disparities
-# Parts in which more are searched show something near. Half of the pixels along each axis tell its depth to a per cent,
-# in an eighth of the time.
-_MOST_IN_FULL = 176
-# Disparities are looked up in so many pixels around masks, and those around these tell on them by smoothness.
+# Disparities from this one on are only searched in images of half the size, which takes an eighth of the time.
+_LEAST_COARSE = 176
+# Disparities are looked up in so many pixels around masks. The pixels around these influence them, because matching
+# smooths disparities.
 _BESIDE_PX, _CONTEXT_PX = 16, 32
 
 
@@ -83,7 +82,6 @@ def _match_coarsely(
     image_left: NDArray[np.uint8],  # (H, W, 3)
     image_right: NDArray[np.uint8],  # (H, W, 3)
     context_px: int,
-    num_disparities: int,
 ) -> NDArray[np.float32]:  # (H, W - context)
     """What `match_disparity` finds in images of half the size, at each pixel of the whole ones."""
     import cv2
@@ -92,7 +90,7 @@ def _match_coarsely(
     size = (width + 1) // 2, (height + 1) // 2
     even = [cv2.copyMakeBorder(x, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE) for x in (image_left, image_right)]
     left, right = (np.asarray(cv2.resize(x, size, interpolation=cv2.INTER_AREA), np.uint8) for x in even)
-    found = 2 * match_disparity(left, right, context_px // 2, math.ceil(num_disparities / 2 / _STEP) * _STEP)
+    found = 2 * match_disparity(left, right, context_px // 2, _NUM_DISPARITIES // 2)
     # The first column of pairs has one pixel of the context where that is odd.
     return found.repeat(2, axis=0).repeat(2, axis=1)[:height, context_px % 2 : context_px % 2 + width - context_px]
 
@@ -109,43 +107,61 @@ def _check_pair(image_left: NDArray[np.uint8], image_right: NDArray[np.uint8]) -
 def with_disparity(frames: FrameBatch, frame_index: Tensor | None = None, extents: Tensor | None = None) -> FrameBatch:
     """The frames with their own disparity, or else with disparity from `match_disparity`.
 
-    Matching parts of images takes as much less time as they are smaller, and 2 in 1000 disparities in them become
-    known or unknown.
+    Things of the depths at which the mask of a car could be as high as a part are matched in full size, with 1 in 1000
+    disparities that become known or unknown by cutting. What is nearer, such as things that hide a car, is matched in
+    images of half the size. Its disparities differ by half a pixel, and more of them are known.
 
     Args:
         frames: F frames; the images pass through the CPU as 8-bit images.
         frame_index: (M,) numbers of the frames to match, in any order and number; other frames get NaN. None means all.
         extents: (M, 4) the parts of these frames to match (u0, v0, u1, v1), half open; what is far from all parts gets
             NaN. As much is matched below a part as the part is high, because the lower end of a car may be hidden
-            there. Disparities are searched up to that of something so near that a car would be higher than the part.
-            None means whole frames, and all disparities.
+            there. None means whole frames, in full size.
+
+    Raises:
+        InputError: extents without the numbers of their frames.
     """
+    if frame_index is None and extents is not None:
+        raise InputError("frame_index", "the number of the frame of each part", "None")
     if frames.disparity is not None:
         return frames
     maps = torch.full_like(frames.images_left[:, 0], torch.nan)
-    largest = None if frame_index is None or extents is None else _largest_disparities(frames, frame_index, extents)
     for k, (height, width) in enumerate(frames.sizes.tolist()):
-        parts = [_Part(0, 0, width, height, _NUM_DISPARITIES)]
-        if frame_index is not None:
-            is_here = frame_index == k
-            parts = parts[: int(is_here.any())]
-            if extents is not None and largest is not None:
-                parts = _parts(extents[is_here].tolist(), largest[is_here].tolist(), height, width)
-        for part in parts:
-            u0, v0, u1, v1 = part.grown(_CONTEXT_PX, height, width)[:4]
-            first = max(u0 - part.num_disparities, 0)
-            left, right = (rgb8(x[k, :, v0:v1, first:u1]) for x in (frames.images_left, frames.images_right))
-            match = match_disparity if extents is None or not part.is_coarse else _match_coarsely
-            found = torch.from_numpy(match(left, right, u0 - first, part.num_disparities)).to(maps)
-            rows, columns = slice(part.v0 - v0, part.v1 - v0), slice(part.u0 - u0, part.u1 - u0)
-            known = maps[k, part.v0 : part.v1, part.u0 : part.u1]
-            # What was found before and is nearer than everything that is searched here stays.
-            known.copy_(torch.where(known >= part.num_disparities, known, found[rows, columns]))
+        left, right = frames.images_left[k], frames.images_right[k]
+        if frame_index is None or extents is None:
+            if frame_index is None or bool((frame_index == k).any()):
+                found = match_disparity(rgb8(left[:, :height, :width]), rgb8(right[:, :height, :width]))
+                maps[k, :height, :width] = torch.from_numpy(found).to(maps)
+            continue
+        is_here = frame_index == k
+        largest = _largest_disparities(frames, frame_index[is_here], extents[is_here])
+        for part in _parts(extents[is_here].tolist(), largest.tolist(), height, width):
+            u0, v0, u1, v1, _ = part.grown(_CONTEXT_PX, height, width)
+            first = max(u0 - _NUM_DISPARITIES, 0)
+            shown = [rgb8(image[:, v0:v1, first:u1]) for image in (left, right)]
+            found = _match_part(shown[0], shown[1], u0 - first, part.num_disparities)
+            found = found[part.v0 - v0 : part.v1 - v0, part.u0 - u0 : part.u1 - u0]
+            maps[k, part.v0 : part.v1, part.u0 : part.u1] = torch.from_numpy(found).to(maps)
     return replace(frames, disparity=maps)
 
 
+def _match_part(
+    image_left: NDArray[np.uint8],  # (H, W, 3)
+    image_right: NDArray[np.uint8],  # (H, W, 3)
+    context_px: int,
+    num_disparities: int,
+) -> NDArray[np.float32]:  # (H, W - context)
+    """Disparities that are searched below a number in full size, and above it in half of the size."""
+    coarse = _match_coarsely(image_left, image_right, context_px)
+    if num_disparities >= _LEAST_COARSE:
+        return coarse
+    skipped = max(context_px - num_disparities, 0)
+    fine = match_disparity(image_left[:, skipped:], image_right[:, skipped:], context_px - skipped, num_disparities)
+    return np.where(coarse >= num_disparities, coarse, fine)  # NaN is not above it
+
+
 def _largest_disparities(frames: FrameBatch, frame_index: Tensor, extents: Tensor) -> Tensor:
-    """The disparities (M,) that are searched in parts, whose height is at least that of the lowest car."""
+    """Numbers (M,) of disparities, up to the one at which the lowest car would be as high as its part."""
     camera, corner = frames.camera, extents[:, 2:].to(frames.images_left)
     K_left, height = camera.K_left[frame_index], (extents[:, 3] - extents[:, 1]).clamp_min(1)
     depth = LEAST_HEIGHT_M * K_left[:, 1, 1] / height
@@ -156,7 +172,7 @@ def _largest_disparities(frames: FrameBatch, frame_index: Tensor, extents: Tenso
 
 
 class _Part(NamedTuple):
-    """A `_Part` of an image gets its disparities, of which those below `num_disparities` are searched."""
+    """A `_Part` is a rectangle of an image in which disparities below `num_disparities` are searched in full size."""
 
     u0: int
     v0: int
@@ -174,24 +190,21 @@ class _Part(NamedTuple):
         return _Part(*map(min, self[:2], other[:2]), *map(max, self[2:], other[2:]))
 
     @property
-    def is_coarse(self) -> bool:
-        """Whether the part is matched in images of half the size."""
-        return self.num_disparities > _MOST_IN_FULL
-
-    @property
     def work(self) -> int:
-        """The number of comparisons that matching in full size makes."""
+        """The number of comparisons that matching makes."""
         width, height = self.u1 - self.u0 + 2 * _CONTEXT_PX, self.v1 - self.v0 + 2 * _CONTEXT_PX
-        return (width + self.num_disparities) * height * self.num_disparities
+        coarse = (width + _NUM_DISPARITIES) * height * _NUM_DISPARITIES // 8
+        fine = (width + self.num_disparities) * height * self.num_disparities
+        return coarse + (fine if self.num_disparities < _LEAST_COARSE else 0)
 
 
 def _parts(extents: list[list[int]], largest: list[int], height: int, width: int) -> list[_Part]:
-    """The parts around extents, of which those are united that take longer apart, the nearest things first."""
+    """The parts around extents, the nearest cars first, of which those are united that take longer apart."""
     parts: list[_Part] = []
     for (u0, v0, u1, v1), num_disparities in zip(extents, largest, strict=True):
         if u0 >= u1 or v0 >= v1:
             continue
-        part = _Part(u0, v0, u1, 2 * v1 - v0, num_disparities).grown(_BESIDE_PX, height, width)
+        part = _Part(u0, v0, u1, 2 * v1 - v0 + _CONTEXT_PX, num_disparities).grown(_BESIDE_PX, height, width)
         while (other := next((each for each in parts if _is_less_together(each, part)), None)) is not None:
             parts.remove(other)
             part = part.with_other(other)
@@ -200,7 +213,8 @@ def _parts(extents: list[list[int]], largest: list[int], height: int, width: int
 
 
 def _is_less_together(one: _Part, other: _Part) -> bool:
-    return one.is_coarse == other.is_coarse and one.with_other(other).work <= one.work + other.work
+    in_full = [part.num_disparities < _LEAST_COARSE for part in (one, other)]
+    return in_full[0] == in_full[1] and one.with_other(other).work <= one.work + other.work
 
 
 def rgb8(

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.kernels.choice import without_kernels
+from directshape_torch.start import rectangle_fit
 from directshape_torch.start.rectangle_fit import InstancePoints, fit_rectangles
 
 
@@ -68,8 +69,24 @@ def test_what_is_unknown_is_nowhere_and_leaves_others_alone() -> None:
     assert places[::2].equal(both(seen)[0][0][::2])
 
 
-def test_a_camera_inside_of_every_rectangle_sees_no_side() -> None:
+def test_places_beside_and_around_the_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without steps the costs are those of the given places, some around the camera, where no side is seen."""
+    monkeypatch.setattr(rectangle_fit, "_NUM_ITERATIONS", 0)
+    monkeypatch.setattr(rectangle_fit, "_RULES", rectangle_fit._RULES._replace(num_iterations=0))
     seen = points(1)
-    at_camera = seen._replace(xz=0.01 * seen.xz, middle=0.01 * seen.middle)
-    native, expected = (each[1].nan_to_num(nan=torch.inf) for each in both(at_camera))
-    torch.testing.assert_close(native.isinf().sum(), expected.isinf().sum())
+    places = torch.tensor([[[0.3, 0.2, 0.1, 4.0, 1.6], [0.2, 1.2, 1.5, 4.0, 1.6], [1.0, 9.0, 0.4, 4.0, 1.6]]])
+    with torch.no_grad():
+        native = rectangle_fit._improved(places, seen)
+        with without_kernels():
+            expected = rectangle_fit._improved(places, seen)
+    torch.testing.assert_close(native[0], expected[0])
+    assert native[1].isfinite().tolist() == expected[1].isfinite().tolist() == [[False, False, True]]
+    torch.testing.assert_close(native[1][0, 2], expected[1][0, 2], rtol=1e-4, atol=0)
+    # A corner behind the camera counts as one at the least depth.
+    behind, seen = torch.tensor([[[3.0, 1.5, 1.5, 4.0, 1.6]]]), seen._replace(middle=0.005 * seen.middle)
+    with torch.no_grad():
+        native = rectangle_fit._improved(behind, seen)
+        with without_kernels():
+            expected = rectangle_fit._improved(behind, seen)
+    assert expected[1].isfinite().all()
+    torch.testing.assert_close(native[1], expected[1], rtol=1e-4, atol=0)

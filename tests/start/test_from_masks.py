@@ -73,9 +73,10 @@ def test_the_result_does_not_depend_on_the_other_masks() -> None:
 
 
 def test_frames_are_matched_where_they_have_no_disparity() -> None:
-    found = started(frames=replace(demo().frame, disparity=None))
-    # Parts of images have other disparities than whole images, by a few or, near the camera, by part of a pixel.
-    torch.testing.assert_close(found.T_cam_obj, started().T_cam_obj, rtol=0, atol=0.1)
+    found, whole = started(frames=replace(demo().frame, disparity=None)).T_cam_obj, started().T_cam_obj
+    # Cutting parts out changes a few disparities, and the third car is so near that it is matched in half of the size.
+    torch.testing.assert_close(found, whole, rtol=0, atol=0.1)
+    assert ((found - whole)[:, :3, 3].norm(dim=1) < 0.05).sum() >= 5
 
 
 def test_a_disparity_field_moves_the_boxes() -> None:

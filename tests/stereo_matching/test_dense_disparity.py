@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from helpers.synthetic_scene import cached_street, joined_frames, measured_street
 
-from directshape_torch import FrameBatch, StereoCamera
-from directshape_torch.stereo_matching.disparity import with_disparity
+from directshape_torch import FrameBatch, InputError, StereoCamera
+from directshape_torch.stereo_matching.disparity import _match_coarsely, _parts, with_disparity
 
 
 def test_frames_keep_the_disparity_that_they_bring() -> None:
@@ -61,7 +62,7 @@ def test_a_part_is_matched_with_its_surroundings_and_what_lies_below_it() -> Non
     matched = part[0].isfinite()
     (rows, columns) = (matched.any(dim=dim).nonzero()[:, 0] for dim in (1, 0))
     assert int(rows[0]) >= 52 - 16
-    assert int(rows[-1]) < 90 + 16
+    assert int(rows[-1]) < 90 + 48
     assert int(columns[0]) >= 88 - 16
     assert int(columns[-1]) < 111 + 16
     # In the part, and next to it, nearly all disparities are those of the whole images.
@@ -71,53 +72,44 @@ def test_a_part_is_matched_with_its_surroundings_and_what_lies_below_it() -> Non
     assert not with_disparity(frames, torch.tensor([0]), extents[1:]).disparity.isfinite().any()  # type: ignore[union-attr]
 
 
-def test_what_is_nearer_than_a_car_of_the_height_of_a_part_is_left_out() -> None:
-    frames = cached_street()[1].frames
-    near = torch.full_like(frames.images_left, 0.5)
-    torch.manual_seed(0)
-    near[0, :, 30:110] = torch.rand(80, 160, dtype=near.dtype)  # The same texture in both images, 80 px apart.
-    right = near.roll(-80, dims=-1)
-    found = with_disparity(
-        replace(frames, images_left=near, images_right=right),
-        torch.tensor([0, 0]),
-        torch.tensor([[120, 40, 150, 50]] * 2),
-    ).disparity
-    assert found is not None
-    assert not (found > 48).any()
+def test_extents_need_the_numbers_of_their_frames() -> None:
+    with pytest.raises(InputError, match="frame_index: expected the number of the frame of each part, got None"):
+        with_disparity(cached_street()[1].frames, extents=torch.tensor([[88, 52, 111, 71]]))
+
+
+@pytest.mark.parametrize("shift", [0, 1])
+def test_near_things_are_found_beside_far_ones(shift: int) -> None:
+    """A wall stands at 30 px of disparity, and before it a thing at 120 px whose right border is column 400."""
+    generator = torch.Generator().manual_seed(0)
+    wall, thing = torch.rand(3, 401, 701, generator=generator), torch.rand(3, 221, 101, generator=generator)
+    left, right = wall.clone(), wall.roll(-30, dims=2)
+    left[:, 100:321, 300:401], right[:, 100:321, 180:281] = thing, thing
+    camera = StereoCamera.from_intrinsics([[700.0, 0, 350], [0, 700, 200], [0, 0, 1]], 0.53)
+    frames = FrameBatch.from_images(left[None], right[None], camera)
+    # The first part is as high as a near car, the second, beside the thing, as a far one.
+    near, far = [300 + shift, 110, 398, 311], [402 + shift, 180, 480, 220]
+    rows, on_thing, on_wall = slice(185, 215), slice(388, 396), slice(412, 480)
+    for extents in ([near], [far], [near, far], [far, near]):
+        found = with_disparity(frames, torch.zeros(len(extents), dtype=torch.long), torch.tensor(extents)).disparity
+        assert found is not None
+        assert ((found[0, rows, on_thing] - 120).abs() < 1).double().mean() > 0.9
+        if far in extents:
+            assert ((found[0, rows, on_wall] - 30).abs() < 0.1).double().mean() > 0.9
+            border = (found[0, rows, 388:420] > 75).sum(dim=1).double().mean()
+            assert (border - 13).abs() < 4
 
 
 def test_parts_are_matched_together_where_that_is_less_work() -> None:
-    frames = cached_street()[1].frames
-    beside, apart = (
-        torch.tensor([[60, 50, 75, 70], [75, 50, 90, 70]]),
-        torch.tensor([[20, 10, 30, 20], [120, 90, 130, 100]]),
-    )
-    for extents in (beside, apart):
-        together = with_disparity(frames, torch.tensor([0, 0]), extents).disparity
-        reversed_order = with_disparity(frames, torch.tensor([0, 0]), extents.flip(0)).disparity
-        torch.testing.assert_close(together, reversed_order, rtol=0, atol=0, equal_nan=True)
+    beside, apart = [[60, 50, 75, 70], [75, 50, 90, 70]], [[20, 10, 30, 20], [320, 290, 330, 300]]
+    assert len(_parts(beside, [48, 48], 400, 600)) == 1
+    assert len(_parts(apart, [48, 48], 400, 600)) == 2
+    # A part that is matched in half of the size alone would take the far ones with it.
+    assert len(_parts(beside, [48, 192], 400, 600)) == 2
 
 
-@pytest.mark.parametrize("u0", [230, 231])
-def test_a_near_part_is_matched_in_half_of_the_size_beside_a_far_one(u0: int) -> None:
-    """A wall stands at 30 px of disparity, and before it a thing at 60 px."""
-    generator = torch.Generator().manual_seed(0)
-    wall, thing = torch.rand(3, 401, 701, generator=generator), torch.rand(3, 221, 201, generator=generator)
-    left, right = wall.clone(), wall.roll(-30, dims=2)
-    left[:, 100:321, 200:401], right[:, 100:321, 140:341] = thing, thing
-    camera = StereoCamera.from_intrinsics([[700.0, 0, 350], [0, 700, 200], [0, 0, 1]], 0.53)
-    frames = FrameBatch.from_images(left[None], right[None], camera)
-    extents = torch.tensor([[u0, 110, 390, 311], [450, 150, 520, 190]])
-    found = with_disparity(frames, torch.tensor([0, 0]), extents).disparity
-    assert found is not None
-    for part, expected, limit in (((110, 311, 240, 390), 60.0, 0.6), ((150, 190, 450, 520), 30.0, 0.1)):
-        v0, v1, a, b = part
-        error = found[0, v0:v1, a:b] - expected
-        assert error.isfinite().double().mean() > 0.9
-        assert error[error.isfinite()].abs().quantile(0.9) < limit
-    # The part of the far thing, which does not reach so near, leaves what is known of the near one.
-    overlap = torch.tensor([[u0, 110, 390, 311], [380, 150, 430, 190]])
-    both = with_disparity(frames, torch.tensor([0, 0]), overlap).disparity
-    assert both is not None
-    near = both[0, 155:185, 370:390]
-    assert ((near - 60).abs() < 1).double().mean() > 0.8
+def test_a_column_more_of_context_moves_nothing() -> None:
+    left = torch.randint(0, 255, (61, 333, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    images = left.numpy(), left.roll(-60, dims=1).numpy()
+    even, odd = (_match_coarsely(*images, context) for context in (10, 11))
+    assert even.shape == (61, 323)
+    np.testing.assert_array_equal(odd, even[:, 1:])
