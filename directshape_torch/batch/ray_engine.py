@@ -109,7 +109,7 @@ class RayEngine:
         except self._ray.exceptions.RayError as error:
             if isinstance(error, tuple(getattr(self._ray.exceptions, name) for name in _DEATHS)):
                 return None
-            raise DirectShapeError(f"the cluster failed: {_last_line(error)}") from error
+            raise DirectShapeError(f"the cluster failed: {error}") from error
 
     def __enter__(self) -> Self:
         return self

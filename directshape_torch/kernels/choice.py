@@ -1,7 +1,7 @@
 """This module decides where native loops take the place of tensor operations, and gives them their arguments.
 
 A loop has the results of its tensor operations but for rounding. It is taken for float32 on a CPU where nothing is
-differentiated and the shape is a `GridShape`; everything else takes the tensor operations.
+differentiated and, if it looks at a shape, the shape is a `GridShape`; everything else takes the tensor operations.
 """
 
 from __future__ import annotations

@@ -43,12 +43,12 @@ def recording(path: Path, inputs: RunInputs) -> Iterator[Callable[[RunFrame], No
         import rerun as rr
     except ImportError as error:
         raise MissingDependencyError("rerun-sdk", "viewer", "a Rerun recording") from error
-    numbers, first = frame_numbers(inputs.run.frame_ids), RunFrame(inputs, inputs.run.frame_ids[0])
+    numbers = frame_numbers(inputs.run.frame_ids)
     stream = rr.RecordingStream("directshape", send_properties=False)
     with replaced_file(path) as file:
         try:
             # The viewer's views are fitted to the image size of the first frame.
-            height, width = first.with_images.frame.sizes[0].tolist()
+            height, width = RunFrame(inputs, inputs.run.frame_ids[0]).with_images.frame.sizes[0].tolist()
             stream.save(file.name, default_blueprint=_blueprint((width, height)))
             # The time of logging does not belong to the refinement.
             stream.set_log_time_enabled(False)

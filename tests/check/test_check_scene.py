@@ -107,6 +107,15 @@ def test_the_refiner_warns_as_often_as_it_is_told() -> None:
         assert all(text.startswith("error: box_origin (all frames, 6 cars): they fit when read as") for text in said)
 
 
+def test_results_do_not_depend_on_the_check() -> None:
+    frames, detections = demo()
+    a, b = (
+        DirectShapeRefiner(config=load_config("fast", [f"check={when}"]))(frames, detections)
+        for when in ("always", "off")
+    )
+    assert a.T_cam_obj.equal(b.T_cam_obj)
+
+
 def test_hopeless_tensors_are_checked_without_errors() -> None:
     frames, detections = demo()
     black = replace(frames, images_left=torch.full_like(frames.images_left, torch.nan), images_right=frames.images_left)

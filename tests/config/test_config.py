@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import runpy
 from itertools import pairwise
 from pathlib import Path
@@ -250,3 +251,18 @@ def test_paper_anneals_the_contour_by_a_factor_of_07() -> None:
     assert widths[0] == 4 * widths[-1] == 1.0
     for softer, sharper in pairwise(widths[:-1]):
         assert sharper == pytest.approx(0.7 * softer, abs=1e-3)
+
+
+def test_paper_names_an_option_that_exists_for_each_deviation() -> None:
+    text = (CONFIGS / "paper.yaml").read_text(encoding="utf-8")
+    header = text[: text.index("\ncompile:")]
+    known = keys(config_to_mapping(RefinerConfig()))
+    named = set(re.findall(r"\b(?:photometric|silhouette|sampling|solver|priors)\.(?!md)[a-z_]+(?:\*)?", header))
+    assert len(named) >= 6
+    for name in named:
+        assert any(key == f".{name}" or (name.endswith("*") and key.startswith(f".{name[:-1]}")) for key in known), name
+
+
+@pytest.mark.parametrize("name", ["geometric", "paper"])
+def test_baselines_take_plain_steps(name: str) -> None:
+    assert {stage.over_relaxation for stage in load_config(name).stages} == {1.0}

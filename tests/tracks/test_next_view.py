@@ -9,7 +9,7 @@ import pytest
 import torch
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import DEFAULT
-from helpers.synthetic_scene import CAMERA_HEIGHT_M, Street, joined_detections, joined_frames, street
+from helpers.synthetic_scene import CAMERA_HEIGHT_M, Street, joined_detections, joined_frames, masked, street
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
@@ -142,6 +142,15 @@ def test_a_side_that_has_turned_away_does_not_count() -> None:
     turned = state._replace(T_obj_next=half_turn @ state.T_obj_next)
     counts = [(x.row_weight[x.blocks.owner == 0] > 0).sum() for x, _ in (begun(problem, state), begun(problem, turned))]
     assert counts[1] < 0.3 * counts[0]
+
+
+def test_a_next_view_without_a_left_mask_shows_nothing() -> None:
+    frames, detections = drive()
+    detections = masked(detections, torch.arange(len(detections)) != 2)
+    term, _ = begun(*at_truth(frames, detections))
+    counted = term.row_weight[..., 0].sum(dim=1)
+    assert (counted[term.blocks.owner == 0] == 0).all()
+    assert (counted[term.blocks.owner == 1] > 0).any()
 
 
 def shifted(values: Tensor, row: int, by: int) -> Tensor:
