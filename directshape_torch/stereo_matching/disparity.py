@@ -22,8 +22,6 @@ _UNIQUENESS_PERCENT = 10
 _FRACTION = 16  # OpenCV counts disparity in sixteenths of a pixel
 _NUM_DISPARITIES = 192  # disparities below this are searched
 _STEP = 16  # OpenCV takes multiples of this number of disparities
-# Disparities from this one on are only searched in images of half the size, which takes an eighth of the time.
-_LEAST_COARSE = 176
 # Disparities are looked up in so many pixels around masks. The pixels around these influence them, because matching
 # smooths disparities.
 _BESIDE_PX, _CONTEXT_PX = 16, 32
@@ -151,12 +149,12 @@ def _match_part(
     context_px: int,
     num_disparities: int,
 ) -> NDArray[np.float32]:  # (H, W - context)
-    """Disparities that are searched below a number in full size, and above it in half of the size."""
-    coarse = _match_coarsely(image_left, image_right, context_px)
-    if num_disparities >= _LEAST_COARSE:
-        return coarse
+    """Disparities that are searched below a number in full size, and from it on in half of the size."""
     skipped = max(context_px - num_disparities, 0)
     fine = match_disparity(image_left[:, skipped:], image_right[:, skipped:], context_px - skipped, num_disparities)
+    if num_disparities == _NUM_DISPARITIES:
+        return fine
+    coarse = _match_coarsely(image_left, image_right, context_px)
     return np.where(coarse >= num_disparities, coarse, fine)  # NaN is not above it
 
 
@@ -193,9 +191,9 @@ class _Part(NamedTuple):
     def work(self) -> int:
         """The number of comparisons that matching makes."""
         width, height = self.u1 - self.u0 + 2 * _CONTEXT_PX, self.v1 - self.v0 + 2 * _CONTEXT_PX
-        coarse = (width + _NUM_DISPARITIES) * height * _NUM_DISPARITIES // 8
         fine = (width + self.num_disparities) * height * self.num_disparities
-        return coarse + (fine if self.num_disparities < _LEAST_COARSE else 0)
+        coarse = (width + _NUM_DISPARITIES) * height * _NUM_DISPARITIES // 8
+        return fine + (coarse if self.num_disparities < _NUM_DISPARITIES else 0)
 
 
 def _parts(extents: list[list[int]], largest: list[int], height: int, width: int) -> list[_Part]:
@@ -213,8 +211,7 @@ def _parts(extents: list[list[int]], largest: list[int], height: int, width: int
 
 
 def _is_less_together(one: _Part, other: _Part) -> bool:
-    in_full = [part.num_disparities < _LEAST_COARSE for part in (one, other)]
-    return in_full[0] == in_full[1] and one.with_other(other).work <= one.work + other.work
+    return one.with_other(other).work <= one.work + other.work
 
 
 def rgb8(

@@ -103,8 +103,8 @@ def test_parts_are_matched_together_where_that_is_less_work() -> None:
     beside, apart = [[60, 50, 75, 70], [75, 50, 90, 70]], [[20, 10, 30, 20], [320, 290, 330, 300]]
     assert len(_parts(beside, [48, 48], 400, 600)) == 1
     assert len(_parts(apart, [48, 48], 400, 600)) == 2
-    # A part that is matched in half of the size alone would take the far ones with it.
-    assert len(_parts(beside, [48, 192], 400, 600)) == 2
+    # A part in which few disparities are searched is less work apart from a near one.
+    assert len(_parts([[20, 50, 220, 70], [150, 50, 190, 150]], [48, 192], 400, 600)) == 2
 
 
 def test_a_column_more_of_context_moves_nothing() -> None:
