@@ -72,6 +72,11 @@ class RunTimings:
         self.peak_device_mb = _larger(self.peak_device_mb, other.peak_device_mb)
 
     @property
+    def refining_share(self) -> float:
+        """The share of the workers' time in calls of the refiner; reading, ground planes and writing have the rest."""
+        return min(sum(call.refine_s for call in self.calls) / (self.workers * self.wall_s), 1.0)
+
+    @property
     def num_frames(self) -> int:
         return sum(len(call.frame_ids) for call in self.calls)
 
@@ -267,9 +272,10 @@ def format_summary(summary: RunSummary) -> str:
         per_car = "" if timings.ms_per_car is None else f"{timings.ms_per_car:.0f} ms per car, "
         where = device_name(timings.device)
         lines.append(f"time     {per_car}{timings.ms_per_frame:.0f} ms per frame (refinement only, {where})")
-    if timings.workers > 1 and timings.wall_s:
-        rate = timings.num_frames / timings.wall_s
-        lines.append(f"rate     {rate:.2f} frames a second by {timings.workers} workers (everything included)")
+    if timings.num_frames and timings.wall_s:
+        rate, share = timings.num_frames / timings.wall_s, timings.refining_share
+        by = f"{timings.workers} worker{'s' if timings.workers > 1 else ''}"
+        lines.append(f"rate     {rate:.2f} frames a second by {by}, of whose time {share:.0%} is refinement")
     host, device = timings.peak_mb or peak_memory_mb(), timings.peak_device_mb
     each = " a worker" if timings.workers > 1 else ""
     sizes = [f"{host:.0f} MB{each}"] if host is not None else []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,13 @@ def test_report() -> None:
     # 0.9 s over 6 cars and 3 frames.
     assert lines[2] == "time     150 ms per car, 300 ms per frame (refinement only, cpu)"
     assert lines[3].startswith("memory   ")
+
+
+def test_the_rate_says_what_share_of_the_time_is_refinement() -> None:
+    """0.9 s of calls in three seconds of two workers."""
+    of_run = replace(timings(), wall_s=3.0, workers=2)
+    lines = format_summary(RunSummary({}, (), {}, (), of_run)).splitlines()
+    assert "rate     1.00 frames a second by 2 workers, of whose time 15% is refinement" in lines
 
 
 def test_a_run_without_work_has_no_time() -> None:
