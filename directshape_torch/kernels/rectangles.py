@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from directshape_torch.kernels.arguments import Doubles, Index, RectangleRules, SeenFromAbove
 from directshape_torch.kernels.jit import SOURCES, loop, step
+
+
+class RectangleSums(NamedTuple):
+    """`RectangleSums` are the sums over all rows of a rectangle, with room for one row of the Jacobian."""
+
+    J: Doubles  # (5,)
+    matrix: Doubles  # (5, 5), of which the lower half is written
+    gradient: Doubles  # (5,)
 
 
 @loop
@@ -13,49 +23,40 @@ def improve(
     rules: RectangleRules, seen: SeenFromAbove, places: Doubles, costs: Doubles, _sources: int = SOURCES
 ) -> None:
     """Move rectangles (M, C, 5) by some steps, and write their costs (M, C)."""
-    matrix, gradient, J, change = np.empty((5, 5)), np.empty(5), np.empty(5), np.empty(5)
+    sums, change = RectangleSums(np.empty(5), np.empty((5, 5)), np.empty(5)), np.empty(5)
     for instance in range(np.uint64(len(places))):
         for number in range(np.uint64(places.shape[1])):
             place = places[instance, number]
             for _ in range(rules.num_iterations):
-                add_rows(rules, seen, instance, place, J, matrix, gradient)
-                solve_in_place(matrix, rules.damping, gradient, change)
+                add_rows(rules, seen, instance, place, sums)
+                solve_in_place(sums.matrix, rules.damping, sums.gradient, change)
                 for k in range(5):
                     # Comparisons with NaN are false, so NaN stays.
                     limit = rules.largest_step[k]
                     step_k = limit if change[k] > limit else change[k]
                     place[k] += -limit if step_k < -limit else step_k
-            costs[instance, number] = add_rows(rules, seen, instance, place, J, matrix, gradient)
+            costs[instance, number] = add_rows(rules, seen, instance, place, sums)
 
 
 @step
-def add_rows(
-    rules: RectangleRules,
-    seen: SeenFromAbove,
-    instance: Index,
-    place: Doubles,
-    J: Doubles,
-    matrix: Doubles,
-    gradient: Doubles,
-) -> float:
+def add_rows(rules: RectangleRules, seen: SeenFromAbove, instance: Index, place: Doubles, sums: RectangleSums) -> float:
     """Write the sums of all rows of a rectangle, and return its cost."""
-    for i in range(5):
-        gradient[i] = 0.0
-        for k in range(5):
-            matrix[i, k] = 0.0
-    cost = add_points(rules, seen, instance, place, J, matrix, gradient)
-    cost += add_outline(rules, seen, instance, place, J, matrix, gradient)
+    sums.gradient[:] = 0.0
+    sums.matrix[:] = 0.0
+    cost = add_points(rules, seen, instance, place, sums)
+    cost += add_outline(rules, seen, instance, place, sums)
     for axis in range(2):
         off = (place[3 + axis] - rules.mean_size[axis]) / rules.size_sigma[axis]
-        J[:] = 0.0
-        J[3 + axis] = 1.0 / rules.size_sigma[axis]
-        add(rules.size_weight, off, J, matrix, gradient)
+        sums.J[:] = 0.0
+        sums.J[3 + axis] = 1.0 / rules.size_sigma[axis]
+        add(rules.size_weight, off, sums)
         cost += rules.size_weight * off * off
     return cost
 
 
 @step
-def add(weight: float, residual: float, J: Doubles, matrix: Doubles, gradient: Doubles) -> None:
+def add(weight: float, residual: float, sums: RectangleSums) -> None:
+    J, matrix, gradient = sums.J, sums.matrix, sums.gradient
     for i in range(5):
         gradient[i] += weight * residual * J[i]
         for k in range(i + 1):
@@ -84,16 +85,10 @@ def solve_in_place(matrix: Doubles, damping: float, gradient: Doubles, change: D
 
 @step
 def add_points(
-    rules: RectangleRules,
-    seen: SeenFromAbove,
-    instance: Index,
-    place: Doubles,
-    J: Doubles,
-    matrix: Doubles,
-    gradient: Doubles,
+    rules: RectangleRules, seen: SeenFromAbove, instance: Index, place: Doubles, sums: RectangleSums
 ) -> float:
     """Add the rows of `_point_rows`, and return their cost."""
-    x, z, c, s = place[0], place[1], np.cos(place[2]), np.sin(place[2])
+    x, z, c, s, J = place[0], place[1], np.cos(place[2]), np.sin(place[2]), sums.J
     half, camera = (0.5 * place[3], 0.5 * place[4]), (s * z - c * x, -s * x - c * z)
     side = (np.sign(camera[0]), np.sign(camera[1]))
     is_seen = (abs(camera[0]) > half[0], abs(camera[1]) > half[1])
@@ -125,22 +120,16 @@ def add_points(
             J[0], J[1], J[2] = (-c, s, -at[1]) if axis == 0 else (-s, -c, at[0])
             J[3], J[4] = 0.0, 0.0
             J[3 + axis] = -0.5 * (side[axis] if axis == nearest else sense)
-            add(weight, residual, J, matrix, gradient)
+            add(weight, residual, sums)
     return cost
 
 
 @step
 def add_outline(
-    rules: RectangleRules,
-    seen: SeenFromAbove,
-    instance: Index,
-    place: Doubles,
-    J: Doubles,
-    matrix: Doubles,
-    gradient: Doubles,
+    rules: RectangleRules, seen: SeenFromAbove, instance: Index, place: Doubles, sums: RectangleSums
 ) -> float:
     """Add the rows of `_outline_rows`, and return their cost."""
-    c, s, scale = np.cos(place[2]), np.sin(place[2]), np.float64(seen.middle[instance, 1])
+    c, s, scale, J = np.cos(place[2]), np.sin(place[2]), np.float64(seen.middle[instance, 1]), sums.J
     cost = 0.0
     for end in range(np.uint64(2)):
         # The first corner in the image, or the last one with the sign turned.
@@ -163,5 +152,5 @@ def add_outline(
             per = scale / depth
             J[0], J[1], J[2] = per, -per * column, per * (dz + column * dx)
             J[3], J[4] = per * (c + column * s) * a, per * (s - column * c) * b
-            add(rules.outline_weight / (1.0 + share) ** 2, off, J, matrix, gradient)
+            add(rules.outline_weight / (1.0 + share) ** 2, off, sums)
     return cost

@@ -118,7 +118,7 @@ def test_frames_are_taken_in_time_and_gaps_are_named(tmp_path: Path) -> None:
 
 
 def test_frames_that_do_not_determine_the_field_are_refused(tmp_path: Path) -> None:
-    """Of one wall, whose points have one depth, any constant bias is another length of the way."""
+    """The points of a single wall have one depth, so any constant bias looks like another length of the way."""
     write_sequence(tmp_path)
     with pytest.raises(InputError, match="determine the field"):
         calibrate(tmp_path, tmp_path / "bias.json", "--camera-height", "0")
